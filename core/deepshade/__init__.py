@@ -1,0 +1,1 @@
+"""The shared language of deepshade: effects, attributes, G-buffers, EXR, metrics, bundles."""

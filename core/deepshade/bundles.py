@@ -1,0 +1,275 @@
+"""Model bundles: one trained shader in one folder, refused unless its hashes match."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from deepshade.attributes import ATTRIBUTES
+from deepshade.effects import EFFECTS
+from deepshade.errors import BundleError, nearest
+from deepshade.files import replacing
+
+MODEL = "model.onnx"
+WEIGHTS = "model.safetensors"
+CONFIG = "config.json"
+METRICS = "metrics.json"
+
+_MAX_BYTES = {CONFIG: 1 << 20, METRICS: 16 << 20, MODEL: 1 << 30, WEIGHTS: 1 << 30}
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_SCALES = ("1/radius", "none")
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """A verified bundle. `config.json` holds every field but `path` and `metrics`.
+
+    `inputs` are attribute names in network order; positions reach the graph multiplied by
+    `position_scale` ("1/radius", or "none"). `radius` is the default effect radius in scene
+    units and `fov` the horizontal angle in degrees that it was trained at. Image sides must be
+    multiples of `size_multiple`; pixels within `halo` of a tile's inner side depend on its
+    neighbour. `ranges` are the (lowest, highest) values seen in training; `hashes` maps file
+    names to sha256.
+    """
+
+    path: Path
+    effect: str
+    name: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    radius: float
+    fov: float
+    size_multiple: int
+    halo: int
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    hashes: dict[str, str] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    version: str = "1"
+    position_scale: str = "1/radius"
+    input_name: str = "gbuffer"
+    output_name: str = "shade"
+
+    @property
+    def model(self) -> Path:
+        """The ONNX graph."""
+        return self.path / MODEL
+
+    @property
+    def weights(self) -> Path:
+        """The same weights for further training."""
+        return self.path / WEIGHTS
+
+    @property
+    def sha256(self) -> str:
+        """The first 12 digits of the graph's hash: short, for headers and logs."""
+        return self.hashes[MODEL][:12]
+
+    @classmethod
+    def load(cls, path: Path | str) -> Bundle:
+        """Reads and verifies a bundle's folder.
+
+        Raises BundleError when a file is missing, too large or doesn't match its hash, or when
+        the configuration has an unknown, missing or impossible entry.
+        """
+        path = Path(path)
+        config = _read_json(path / CONFIG)
+        metrics = _read_json(path / METRICS) if (path / METRICS).exists() else {}
+        bundle = _from_config(path, config, metrics)
+        for name, expected in bundle.hashes.items():
+            found = file_sha256(path / name)
+            if found != expected:
+                raise BundleError(
+                    f"{path / name} is not the file that {CONFIG} describes "
+                    f"(sha256 {found[:12]}…, expected {expected[:12]}…)",
+                    fix="get the bundle again, or export it again",
+                )
+        return bundle
+
+
+def find_bundles(root: Path | str) -> list[Bundle]:
+    """Every bundle under `root`/<effect>/<name>/, verified, by effect and name.
+
+    An absent root holds none. Raises BundleError if one of them is broken.
+    """
+    return [Bundle.load(path.parent) for path in sorted(Path(root).glob(f"*/*/{CONFIG}"))]
+
+
+def write_config(
+    path: Path | str,
+    *,
+    effect: str,
+    name: str,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    radius: float,
+    fov: float,
+    size_multiple: int,
+    halo: int,
+    ranges: Mapping[str, Sequence[float]] | None = None,
+    metrics: Mapping[str, Any] | None = None,
+    version: str = "1",
+    position_scale: str = "1/radius",
+    input_name: str = "gbuffer",
+    output_name: str = "shade",
+) -> Bundle:
+    """Completes a bundle's folder that already holds its model files: hashes and configuration.
+
+    Written atomically, `config.json` last: a folder without it is no bundle yet. Raises
+    BundleError for missing files or impossible values.
+    """
+    path = Path(path)
+    config: dict[str, Any] = {
+        "effect": effect,
+        "name": name,
+        "version": version,
+        "inputs": list(inputs),
+        "outputs": list(outputs),
+        "input_name": input_name,
+        "output_name": output_name,
+        "position_scale": position_scale,
+        "radius": radius,
+        "fov": fov,
+        "size_multiple": size_multiple,
+        "halo": halo,
+        "ranges": {key: list(value) for key, value in (ranges or {}).items()},
+        "hashes": {file: file_sha256(path / file) for file in (MODEL, WEIGHTS)},
+    }
+    bundle = _from_config(path, config, dict(metrics or {}))
+    if metrics is not None:
+        _write_json(path / METRICS, metrics)
+    _write_json(path / CONFIG, config)
+    return bundle
+
+
+def file_sha256(path: Path) -> str:
+    """The sha256 of a file, hexadecimal. Raises BundleError if it is absent or too large."""
+    _check_size(path)
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def config_of(bundle: Bundle) -> dict[str, Any]:
+    """What `config.json` says, as plain JSON values."""
+    config = asdict(bundle)
+    del config["path"], config["metrics"]
+    return {key: list(v) if isinstance(v, tuple) else v for key, v in config.items()}
+
+
+def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any]) -> Bundle:
+    known = {f.name: f for f in fields(Bundle) if f.name not in ("path", "metrics")}
+    where = path / CONFIG
+    for key in config:
+        if key not in known:
+            near = nearest(key, known)
+            raise BundleError(
+                f"{where}: unknown entry '{key}'", fix=f"did you mean '{near}'?" if near else ""
+            )
+    for key in ("effect", "name", "inputs", "outputs", "radius", "fov", "size_multiple", "halo"):
+        if key not in config:
+            near = nearest(key, config)
+            hint = f"; is it '{near}'?" if near and near not in known else ""
+            raise BundleError(f"{where}: the entry '{key}' is missing", fix=f"add it{hint}")
+    values = dict(config)
+    for key, (check, wanted) in _CHECKS.items():
+        if key in values and not check(values[key]):
+            raise BundleError(f"{where}: '{key}' is {values[key]!r:.60}, it must be {wanted}")
+    for name in values["inputs"]:
+        if name not in ATTRIBUTES:
+            near = nearest(name, ATTRIBUTES)
+            raise BundleError(
+                f"{where}: no attribute is called '{name}'",
+                fix=f"did you mean '{near}'?" if near else "",
+            )
+    hashes = values.get("hashes", {})
+    for name in (MODEL, WEIGHTS):
+        if name not in hashes:
+            raise BundleError(f"{where}: 'hashes' has none for {name}", fix="export it again")
+    values["inputs"], values["outputs"] = tuple(values["inputs"]), tuple(values["outputs"])
+    values["ranges"] = {k: (float(v[0]), float(v[1])) for k, v in values.get("ranges", {}).items()}
+    values["radius"], values["fov"] = float(values["radius"]), float(values["fov"])
+    return Bundle(path=path, metrics=metrics, **values)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _whole(value: Any, lowest: int, highest: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and lowest <= value <= highest
+
+
+def _names(value: Any) -> bool:
+    return (
+        isinstance(value, (list, tuple))
+        and 0 < len(value) <= 64
+        and all(isinstance(v, str) and v for v in value)
+        and len(set(value)) == len(value)
+    )
+
+
+def _label(value: Any) -> bool:
+    return isinstance(value, str) and _NAME.fullmatch(value) is not None
+
+
+def _ranges(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        isinstance(v, (list, tuple)) and len(v) == 2 and all(map(_number, v)) and v[0] <= v[1]
+        for v in value.values()
+    )
+
+
+def _hashes(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        _label(name) and isinstance(digest, str) and re.fullmatch("[0-9a-f]{64}", digest)
+        for name, digest in value.items()
+    )
+
+
+_CHECKS: dict[str, tuple[Any, str]] = {
+    "effect": (lambda v: v in EFFECTS, f"one of {', '.join(EFFECTS)}"),
+    "name": (_label, "a short name of letters, digits, '.', '_' and '-'"),
+    "version": (_label, "a short text of letters, digits, '.', '_' and '-'"),
+    "inputs": (_names, "a list of attribute names"),
+    "outputs": (_names, "a list of channel names"),
+    "input_name": (_label, "a tensor's name"),
+    "output_name": (_label, "a tensor's name"),
+    "position_scale": (lambda v: v in _SCALES, f"one of {', '.join(_SCALES)}"),
+    "radius": (lambda v: _number(v) and v > 0, "a number > 0"),
+    "fov": (lambda v: _number(v) and 0 < v < 180, "degrees between 0 and 180"),
+    "size_multiple": (lambda v: _whole(v, 1, 4096), "a whole number from 1 to 4096"),
+    "halo": (lambda v: _whole(v, 0, 8192), "a whole number from 0 to 8192"),
+    "ranges": (_ranges, "pairs of numbers, lowest first"),
+    "hashes": (_hashes, "file names with sha256 digests"),
+}
+
+
+def _check_size(path: Path) -> None:
+    try:
+        size = path.stat().st_size
+    except OSError:
+        raise BundleError(f"{path} is missing", fix="get or export the bundle again") from None
+    maximum = _MAX_BYTES.get(path.name, 1 << 30)
+    if size > maximum:
+        raise BundleError(f"{path} has {size:,} bytes, at most {maximum:,} are allowed")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    _check_size(path)
+    try:
+        value = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise BundleError(f"{path} is no valid JSON: {error}") from None
+    if not isinstance(value, dict):
+        raise BundleError(f"{path} must hold a JSON object")
+    return value
+
+
+def _write_json(path: Path, value: Mapping[str, Any]) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n", "utf-8")

@@ -1,0 +1,228 @@
+"""The pinhole camera of an image: where its pixels are, and how world and camera space relate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from deepshade.errors import CameraError
+
+Window = tuple[int, int, int, int]
+_FALLBACK_UP = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Camera space is right-handed: +x right, +y up, looking down -z. `fov` is the full horizontal
+    angle in degrees across the whole frame (the display window, `width` x `height` pixels).
+    `world_to_camera` is (4, 4) float64 and multiplies column vectors; None when unknown.
+    `x0`, `y0` is where the stored pixels (the data window) start within the frame.
+    `center` is the optical axis' offset from the frame's middle (OpenEXR's screenWindowCenter,
+    in units of the image plane at distance 1), for shifted lenses.
+    """
+
+    fov: float
+    width: int
+    height: int
+    world_to_camera: NDArray[np.float64] | None = field(default=None, compare=False)
+    x0: int = 0
+    y0: int = 0
+    center: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.fov) and 0.0 < self.fov < 180.0):
+            raise CameraError(
+                f"the field of view is {self.fov}°, it must lie between 0 and 180",
+                fix="give the full horizontal angle in degrees: --fov 50",
+            )
+        if self.width < 1 or self.height < 1:
+            raise CameraError(f"the frame is {self.width} x {self.height} pixels")
+        if self.world_to_camera is not None:
+            object.__setattr__(self, "world_to_camera", _checked_matrix(self.world_to_camera))
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: ArrayLike,
+        target: ArrayLike,
+        up: ArrayLike,
+        fov: float,
+        width: int,
+        height: int,
+    ) -> Camera:
+        """A camera at `eye` looking to `target`, both (3,) in world space; `up` points up.
+
+        Where `up` is parallel to the view (or zero), +z or else +y replaces it.
+        Raises CameraError when eye and target coincide or any value isn't finite.
+        """
+        eye_, target_, up_ = (np.asarray(v, np.float64).reshape(3) for v in (eye, target, up))
+        backward = eye_ - target_  # camera +z, away from the target
+        distance = float(np.linalg.norm(backward))
+        if not (np.isfinite(up_).all() and math.isfinite(distance) and distance > 0):
+            raise CameraError(
+                f"can't look from {eye_.tolist()} to {target_.tolist()}",
+                fix="give two different, finite points",
+            )
+        backward /= distance
+        right = np.zeros(3)
+        for candidate in (up_, *map(np.array, _FALLBACK_UP)):
+            right = np.cross(candidate, backward)
+            length = float(np.linalg.norm(right))
+            if length > 1e-9 * float(np.linalg.norm(candidate)):
+                right /= length
+                break
+        matrix = np.eye(4)
+        matrix[:3, :3] = right, np.cross(backward, right), backward
+        matrix[:3, 3] = -matrix[:3, :3] @ eye_
+        return cls(float(fov), int(width), int(height), matrix)
+
+    @property
+    def eye(self) -> NDArray[np.float64]:
+        """The camera's place in world space, (3,). Raises CameraError without a matrix."""
+        return np.asarray(np.linalg.solve(self.matrix, (0.0, 0.0, 0.0, 1.0))[:3], np.float64)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """`world_to_camera`, or CameraError when it is unknown."""
+        if self.world_to_camera is None:
+            raise CameraError(
+                "the camera's matrix is unknown",
+                fix="write the standard header attribute 'worldToCamera' (M44f)",
+            )
+        return self.world_to_camera
+
+    @property
+    def pixels_per_unit(self) -> float:
+        """Pixels that a length of 1 at distance 1 spans: (width / 2) / tan(fov / 2)."""
+        return 0.5 * self.width / math.tan(math.radians(self.fov) / 2)
+
+    def rays(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
+        """Camera-space directions with z = -1 through the stored pixels' centres: (3, H, W).
+
+        `width` and `height` are those of the data window; the whole frame by default.
+        """
+        width = self.width if width is None else width
+        height = self.height if height is None else height
+        scale = 1.0 / self.pixels_per_unit
+        x = (np.arange(width) + (self.x0 + 0.5 - 0.5 * self.width)) * scale + self.center[0]
+        y = (0.5 * self.height - self.y0 - 0.5 - np.arange(height)) * scale + self.center[1]
+        out = np.empty((3, height, width), np.float32)
+        out[0] = x
+        out[1] = y[:, None]
+        out[2] = -1.0
+        return out
+
+    def position_from_depth(self, depth: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        """P_s, (3, H, W), from planar depth (H, W) in scene units; non-finite depth stays so."""
+        out = self.rays(depth.shape[1], depth.shape[0])
+        with np.errstate(invalid="ignore", over="ignore"):  # 0 * inf on background pixels
+            out *= np.asarray(depth, np.float32)
+        return out
+
+    def to_header(self) -> dict[str, Any]:
+        """The EXR attributes that `from_header` reads (the windows are the writer's)."""
+        header: dict[str, Any] = {
+            "deepshade:fov": float(self.fov),
+            # OpenEXR's screen window is the image plane at distance 1
+            "screenWindowWidth": 2.0 * math.tan(math.radians(self.fov) / 2),
+            "screenWindowCenter": tuple(float(c) for c in self.center),
+        }
+        if self.world_to_camera is not None:
+            # Imath multiplies row vectors, so the file holds the transpose
+            header["worldToCamera"] = self.world_to_camera.T.astype(np.float32)
+        return header
+
+    @classmethod
+    def from_header(
+        cls,
+        attributes: Mapping[str, Any],
+        data_window: Window,
+        display_window: Window,
+        *,
+        fov: float | None = None,
+    ) -> Camera | None:
+        """The camera an EXR header describes, or None if it has no field of view.
+
+        Windows are (x0, y0, x1, y1), inclusive. `fov` (degrees) overrides the header. Without
+        `deepshade:fov` the angle comes from `screenWindowWidth`, but only where that isn't 1,
+        the value that most programs write when they know nothing.
+        Raises CameraError when a matrix or angle is there but unusable.
+        """
+        screen_width = _number(attributes.get("screenWindowWidth"))
+        if fov is None:
+            fov = _number(attributes.get("deepshade:fov"))
+        if fov is None and screen_width is not None and 0 < screen_width != 1.0:
+            fov = math.degrees(2.0 * math.atan(screen_width / 2))
+        if fov is None:
+            return None
+        return cls(
+            fov=float(fov),
+            width=display_window[2] - display_window[0] + 1,
+            height=display_window[3] - display_window[1] + 1,
+            world_to_camera=matrix_from_header(attributes),
+            x0=data_window[0] - display_window[0],
+            y0=data_window[1] - display_window[1],
+            center=_pair(attributes.get("screenWindowCenter")),
+        )
+
+
+def matrix_from_header(attributes: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """`worldToCamera` of an EXR header as a column-vector matrix (4, 4), or None."""
+    value = attributes.get("worldToCamera")
+    if value is None:
+        return None
+    try:
+        matrix = np.asarray(value, np.float64).reshape(4, 4).T
+    except (TypeError, ValueError):
+        raise CameraError("the header's worldToCamera is no 4 x 4 matrix") from None
+    return _checked_matrix(matrix)
+
+
+def rotation_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The (3, 3) part of an affine matrix that turns directions, without its scale.
+
+    A polar decomposition takes scale and shear out; a rigid (or mirroring) matrix stays as it is.
+    """
+    u, _, vt = np.linalg.svd(matrix[:3, :3])
+    return np.asarray(u @ vt, np.float64)
+
+
+def _checked_matrix(matrix: ArrayLike) -> NDArray[np.float64]:
+    result = np.array(matrix, np.float64)
+    if result.shape != (4, 4) or not np.isfinite(result).all():
+        raise CameraError("worldToCamera must be a finite 4 x 4 matrix")
+    linear = result[:3, :3]
+    scale = float(np.abs(linear).max())
+    # relative to its own size: a scene in kilometres may scale by 1e-3 without being singular
+    if scale == 0 or abs(np.linalg.det(linear / scale)) < 1e-9:
+        raise CameraError("worldToCamera can't be inverted", fix="check the renderer's camera")
+    if abs(result[3, 3]) < 1e-12 or np.abs(result[3, :3]).max() > 1e-6 * abs(result[3, 3]):
+        raise CameraError(
+            "worldToCamera has a projective part; it must be affine",
+            fix="write the view matrix alone, without the projection",
+        )
+    result /= result[3, 3]
+    result[3] = 0, 0, 0, 1
+    result.flags.writeable = False
+    return result
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, (int, float, np.floating, np.integer)) and math.isfinite(value):
+        return float(value)
+    return None
+
+
+def _pair(value: Any) -> tuple[float, float]:
+    if isinstance(value, (Sequence, np.ndarray)) and len(value) == 2:
+        x, y = _number(value[0]), _number(value[1])
+        if x is not None and y is not None:
+            return x, y
+    return 0.0, 0.0

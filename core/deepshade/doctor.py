@@ -1,0 +1,196 @@
+"""`deepshade doctor`: is everything there, and if not, the line that puts it right."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from deepshade.errors import BundleError
+from deepshade.extras import EXTRAS, installed, missing_packages
+from deepshade.llvm import FIX as LLVM_FIX
+from deepshade.llvm import find_libllvm, libllvm_version
+from deepshade.machine import cpu_count, cpu_quota, memory_bytes
+
+_GIB = 1024**3
+_CORE = (("numpy", "numpy"), ("OpenEXR", "OpenEXR"), ("typer", "typer"), ("rich", "rich"))
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One finding. A failed `required` check makes `deepshade doctor` exit with 1."""
+
+    name: str
+    ok: bool
+    required: bool
+    detail: str
+    fix: str = ""
+
+
+def doctor(
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Check this machine for everything deepshade needs, and print how to fix what is missing."""
+    checks = run_checks()
+    if json:
+        import json as json_module
+
+        typer.echo(json_module.dumps([asdict(check) for check in checks], indent=2))
+    else:
+        _show(checks)
+    if any(check.required and not check.ok for check in checks):
+        raise typer.Exit(1)
+
+
+def run_checks(checks: Sequence[Callable[[], list[Check]]] | None = None) -> list[Check]:
+    """Every check's findings; none of them imports a heavy package."""
+    return [check for function in (checks or _CHECKS) for check in function()]
+
+
+def check_python() -> list[Check]:
+    """Python itself."""
+    version = ".".join(map(str, sys.version_info[:3]))
+    ok = sys.version_info >= (3, 11)
+    return [Check("python", ok, True, version, "" if ok else "install Python 3.11 or newer")]
+
+
+def check_packages() -> list[Check]:
+    """The core's packages, which are required, and each extra's, which aren't."""
+    lacking = [package for module, package in _CORE if not installed(module)]
+    checks = [
+        Check(
+            "core packages",
+            not lacking,
+            True,
+            f"missing: {', '.join(lacking)}" if lacking else "all installed",
+            "pip install deepshade" if lacking else "",
+        )
+    ]
+    for extra in EXTRAS:
+        lacking = missing_packages(extra)
+        checks.append(
+            Check(
+                f"extra '{extra}'",
+                not lacking,
+                False,
+                f"missing: {', '.join(lacking)}" if lacking else "all installed",
+                f"pip install 'deepshade[{extra}]'" if lacking else "",
+            )
+        )
+    return checks
+
+
+def check_llvm() -> list[Check]:
+    """libLLVM, which Mitsuba needs to render on the CPU; required once Mitsuba is installed."""
+    needed = installed("mitsuba")
+    path = find_libllvm()
+    if path is None:
+        wrong = os.environ.get("DRJIT_LIBLLVM_PATH")
+        detail = f"DRJIT_LIBLLVM_PATH names no file: {wrong}" if wrong else "none from 17 on found"
+        return [Check("libLLVM", False, needed, detail, LLVM_FIX)]
+    version = libllvm_version(path)
+    if version is not None and version < 17:  # named by the environment
+        detail = f"{path} is version {version}; Mitsuba needs 17 or newer"
+        return [Check("libLLVM", False, needed, detail, LLVM_FIX)]
+    return [Check("libLLVM", True, needed, f"{path}" + (f" ({version})" if version else ""))]
+
+
+def check_shared_memory(path: Path = Path("/dev/shm")) -> list[Check]:
+    """/dev/shm, where Ray's workers exchange arrays."""
+    if not path.is_dir():
+        return [Check("shared memory", True, False, "no /dev/shm on this system")]
+    total = shutil.disk_usage(path).total
+    fix = "" if total >= _GIB else "docker run --shm-size=2g … (compose: shm_size: 2g)"
+    return [Check("shared memory", total >= _GIB, False, f"{total / _GIB:.1f} GiB in {path}", fix)]
+
+
+def check_machine() -> list[Check]:
+    """CPUs and memory, as far as this process may use them."""
+    quota = cpu_quota()
+    cpus = f"{cpu_count()} usable of {os.cpu_count()}" + (f", quota {quota:g}" if quota else "")
+    memory = memory_bytes()
+    enough = memory == 0 or memory >= 2 * _GIB
+    return [
+        Check("CPUs", True, False, cpus),
+        Check(
+            "memory",
+            enough,
+            False,
+            f"{memory / _GIB:.1f} GiB" if memory else "unknown",
+            "" if enough else "give the machine or container at least 2 GiB",
+        ),
+    ]
+
+
+def check_bundles(root: Path | None = None) -> list[Check]:
+    """The shipped models: each must match its hashes."""
+    from deepshade.bundles import Bundle
+
+    root = root or bundle_root()
+    folders = [path.parent for path in sorted(root.glob("*/*/config.json"))]
+    if not folders:
+        return [
+            Check("models", False, False, f"none in {root}", "deepshade export, or get models/")
+        ]
+    checks = []
+    for folder in folders:
+        name = f"model {folder.parent.name}/{folder.name}"
+        try:
+            bundle = Bundle.load(folder)
+        except BundleError as error:
+            checks.append(Check(name, False, True, str(error), error.fix))
+        else:
+            checks.append(Check(name, True, True, f"sha256 {bundle.sha256}…"))
+    return checks
+
+
+def check_port(port: int = 8000) -> list[Check]:
+    """Whether the service's usual port is free."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            detail = error.strerror or str(error)
+            fix = f"stop what listens there (ss -ltnp 'sport = :{port}'), or serve --port elsewhere"
+            return [Check(f"port {port}", False, False, detail, fix)]
+    return [Check(f"port {port}", True, False, "free")]
+
+
+def bundle_root() -> Path:
+    """Where the shipped bundles are: `DEEPSHADE_MODELS`, or `models/` of the source tree."""
+    chosen = os.environ.get("DEEPSHADE_MODELS")
+    return Path(chosen) if chosen else Path(__file__).resolve().parents[2] / "models"
+
+
+_CHECKS: tuple[Callable[[], list[Check]], ...] = (
+    check_python,
+    check_packages,
+    check_llvm,
+    check_shared_memory,
+    check_machine,
+    check_bundles,
+    check_port,
+)
+
+
+def _show(checks: Sequence[Check]) -> None:
+    from rich.markup import escape
+
+    from deepshade.console import stdout
+
+    console = stdout()
+    for check in checks:
+        mark = "[green]ok     [/green]"
+        if not check.ok:
+            mark = "[red]MISSING[/red]" if check.required else "[yellow]warning[/yellow]"
+        console.print(f"{mark}  {escape(check.name)}: {escape(check.detail)}", soft_wrap=True)
+        if check.fix:
+            console.print(f"         fix: {escape(check.fix)}", soft_wrap=True)

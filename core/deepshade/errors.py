@@ -1,0 +1,119 @@
+"""Everything deepshade raises on bad input: one tree, each error says what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+
+
+class DeepshadeError(Exception):
+    """Something about the input or the set-up is wrong. `str()` says what, `.fix` what to do."""
+
+    def __init__(self, detail: str, *, fix: str = "") -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.fix = fix
+
+
+class ImageError(DeepshadeError):
+    """The bytes are no OpenEXR image, or one of a kind that deepshade can't use."""
+
+
+class DamagedImageError(ImageError):
+    """An OpenEXR image, but truncated or corrupt."""
+
+
+class LimitError(DeepshadeError):
+    """A size exceeds its limit; known before any pixel is decoded."""
+
+    def __init__(self, limit: str, value: int, maximum: int) -> None:
+        what = limit.replace("_", " ")
+        super().__init__(
+            f"the image has {value:,} {what}, the limit is {maximum:,}",
+            fix=f"send a smaller image, or raise the limit '{limit}'",
+        )
+        self.limit = limit
+        self.value = value
+        self.maximum = maximum
+
+
+class MissingAttributeError(DeepshadeError):
+    """Attributes that an effect needs are neither in the image nor derivable from it."""
+
+    def __init__(
+        self,
+        missing: Sequence[str],
+        found: Sequence[str],
+        near: Mapping[str, Sequence[str]] | None = None,
+        *,
+        why: Mapping[str, str] | None = None,
+    ) -> None:
+        near = {name: tuple(close) for name, close in (near or {}).items() if close}
+        parts = []
+        for name in missing:
+            reason = f" ({why[name]})" if why and why.get(name) else ""
+            parts.append(f"'{name}'{reason}")
+        shown = ", ".join(found[:24]) + (", …" if len(found) > 24 else "")
+        super().__init__(
+            f"missing {', '.join(parts)}; channels found: {shown or 'none'}",
+            fix=_mapping_hint(missing, near),
+        )
+        self.missing = tuple(missing)
+        self.found = tuple(found)
+        self.near = near
+
+
+class AmbiguousChannelError(DeepshadeError):
+    """Several channels could be the same attribute; deepshade never guesses."""
+
+    def __init__(self, attribute: str, candidates: Sequence[str]) -> None:
+        super().__init__(
+            f"'{attribute}' could be any of: {', '.join(candidates)}",
+            fix=f"choose one: --map {attribute}={candidates[0]}" if candidates else "",
+        )
+        self.attribute = attribute
+        self.candidates = tuple(candidates)
+
+
+class CameraError(DeepshadeError):
+    """A derivation needs a field of view or camera matrix that is absent or unusable."""
+
+
+class BundleError(DeepshadeError):
+    """A model bundle is incomplete, malformed, or its files don't match their hashes."""
+
+
+class DataError(DeepshadeError):
+    """A data set (shards, manifest) is incomplete, damaged or of another schema."""
+
+
+class SceneError(DeepshadeError):
+    """A scene can't be read or makes no sense."""
+
+
+class ConfigError(DeepshadeError):
+    """A setting has an unknown name or an impossible value."""
+
+    def __init__(self, key: str, known: Iterable[str] = (), *, detail: str = "") -> None:
+        self.key = key
+        self.nearest = nearest(key, known)
+        super().__init__(
+            detail or f"unknown setting '{key}'",
+            fix=f"did you mean '{self.nearest}'?" if self.nearest else "",
+        )
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """The known name closest to `name` (case-insensitive), or None if none is close."""
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    match = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=0.5)
+    return by_lower[match[0]] if match else None
+
+
+def _mapping_hint(missing: Sequence[str], near: Mapping[str, Sequence[str]]) -> str:
+    for name in missing:
+        if near.get(name):
+            return f"if '{near[name][0]}' is it: --map {name}={near[name][0]}"
+    if missing:
+        return f"render with that pass on, or name its channel: --map {missing[0]}=<layer>"
+    return ""

@@ -1,0 +1,238 @@
+"""`deepshade inspect`: what is in an EXR, what it maps to, what is missing for each effect."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from deepshade.exr import Limits
+    from deepshade.gbuffer import Plan
+
+
+def inspect(
+    files: Annotated[list[Path], typer.Argument(help="EXR files of one view.")],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
+    map_: Annotated[
+        list[str] | None,
+        typer.Option("--map", help="attribute=layer, or attribute=channel,channel,channel."),
+    ] = None,
+    profile: Annotated[
+        str | None, typer.Option(help="The renderer whose names and conventions to use.")
+    ] = None,
+    fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+) -> None:
+    """Show what EXR files hold, what it maps to, and what each effect still needs."""
+    from deepshade.channels import parse_mapping
+
+    report = inspect_files(files, mapping=parse_mapping(map_ or ()), profile=profile, fov=fov)
+    if json:
+        import json as json_module
+
+        typer.echo(json_module.dumps(report, indent=2))
+    else:
+        from deepshade.console import stdout
+
+        _show(report, stdout())
+
+
+def inspect_files(
+    files: Sequence[Path | str],
+    *,
+    mapping: Mapping[str, str] | None = None,
+    profile: str | None = None,
+    fov: float | None = None,
+    limits: Limits | None = None,
+) -> dict[str, Any]:
+    """The report on files of one view, as plain JSON values.
+
+    Keys: files (parts, channels, windows), profile, camera, mapped, ambiguous, effects (for each:
+    ready, have, derived, missing) and statistics. Raises what `load_gbuffer` raises for files
+    that can't be read, but not for missing or ambiguous attributes: those are the report.
+    """
+    from deepshade import exr
+    from deepshade.attributes import ATTRIBUTES
+    from deepshade.effects import EFFECTS
+    from deepshade.gbuffer import plan_gbuffer
+
+    limits = limits or exr.Limits()
+    paths = [Path(file) for file in files]
+    bodies = [exr.fetch(path, limits) for path in paths]
+    headers = [exr.read_header(body, limits) for body in bodies]
+    plan = plan_gbuffer(
+        headers,
+        [path.stem for path in paths],
+        list(ATTRIBUTES),
+        profile=profile,
+        mapping=mapping,
+        fov=fov,
+    )
+    return {
+        "files": [_file(path, header) for path, header in zip(paths, headers, strict=True)],
+        "profile": plan.profile.name if plan.profile else None,
+        "camera": _camera(plan),
+        "mapped": {name: str(choice) for name, choice in plan.choices.items()},
+        "ambiguous": {name: list(e.candidates) for name, e in plan.ambiguous.items()},
+        "effects": {name: _effect(plan, effect.inputs) for name, effect in EFFECTS.items()},
+        "statistics": _statistics(plan, bodies, limits),
+    }
+
+
+def _file(path: Path, header: Any) -> dict[str, Any]:
+    return {
+        "file": str(path),
+        "bytes": header.body_bytes,
+        "decoded_bytes": header.decoded_bytes,
+        "parts": [
+            {
+                "name": part.name,
+                "channels": part.channels,
+                "data_window": list(part.data_window),
+                "display_window": list(part.display_window),
+                "compression": part.compression,
+                "tiled": part.tiled,
+                "subsampled": sorted(part.subsampled),
+            }
+            for part in header.parts
+        ],
+    }
+
+
+def _camera(plan: Plan) -> dict[str, Any]:
+    return {
+        "fov": plan.camera.fov if plan.camera else None,
+        "world_to_camera": plan.matrix.tolist() if plan.matrix is not None else None,
+    }
+
+
+def _effect(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
+    from deepshade.channels import near_misses
+    from deepshade.errors import AmbiguousChannelError, DeepshadeError
+
+    missing: dict[str, Any] = {}
+    derived: dict[str, str] = {}
+    have: list[str] = []
+    for name in inputs:
+        try:
+            plan.require([name])
+        except AmbiguousChannelError as error:
+            missing[name] = {"why": str(error), "fix": error.fix, "near": list(error.candidates)}
+        except DeepshadeError as error:
+            near = list(near_misses(plan.layers, name))
+            missing[name] = {"why": plan.explain(name), "fix": error.fix, "near": near}
+        else:
+            steps = plan.steps(name) or []
+            derived |= {step.target: plan.how(step) for step in steps}
+            if not steps:
+                have.append(name)
+    return {"ready": not missing, "have": have, "derived": derived, "missing": missing}
+
+
+def _statistics(plan: Plan, bodies: Sequence[bytes], limits: Limits) -> dict[str, Any]:
+    """Of every mapped quantity: pixels, non-finite ones, the finite values' range; lengths."""
+    import numpy as np
+
+    from deepshade import exr
+
+    result: dict[str, Any] = {}
+    for index, body in enumerate(bodies):
+        mine = {name: choice for name, choice in plan.choices.items() if choice.file == index}
+        if not mine:
+            continue
+        wanted = [channel for choice in mine.values() for channel in choice.channels]
+        image = exr.read(body, wanted, limits)
+        for name, choice in mine.items():
+            values = image.stack(choice.channels)
+            finite = np.isfinite(values).all(axis=0)
+            inside = values[:, finite]
+            row: dict[str, Any] = {
+                "pixels": int(finite.size),
+                "nonfinite": int(finite.size - np.count_nonzero(finite)),
+                "min": [float(v) for v in inside.min(1)] if inside.size else None,
+                "max": [float(v) for v in inside.max(1)] if inside.size else None,
+            }
+            if name in ("normal", "normal_world") and inside.size:
+                lengths = np.sqrt((inside.astype(np.float64) ** 2).sum(0))
+                lit = lengths[lengths > 0]
+                row["zero"] = int(lengths.size - lit.size)
+                row["length"] = [float(lit.min()), float(lit.max())] if lit.size else None
+            if name in ("depth", "distance") and inside.size:
+                hit = inside[(inside > 0) & (inside < 1e10)]
+                row["background"] = int(finite.size - hit.size)
+                row["depth"] = [float(hit.min()), float(hit.max())] if hit.size else None
+            result[name] = row
+    return result
+
+
+def _show(report: Mapping[str, Any], console: Console) -> None:
+    from rich.table import Table
+
+    for file in report["files"]:
+        console.print(f"[bold]{_safe(file['file'])}[/bold]  {file['bytes']:,} bytes")
+        table = Table("part", "size", "window", "frame", "compression", "channels")
+        for index, part in enumerate(file["parts"]):
+            x0, y0, x1, y1 = part["data_window"]
+            fx0, fy0, fx1, fy1 = part["display_window"]
+            table.add_row(
+                _safe(part["name"] or str(index)),
+                f"{x1 - x0 + 1} x {y1 - y0 + 1}",
+                f"({x0}, {y0}) to ({x1}, {y1})",
+                f"({fx0}, {fy0}) to ({fx1}, {fy1})",
+                part["compression"] + (" tiled" if part["tiled"] else ""),
+                _safe(", ".join(f"{name} {kind}" for name, kind in part["channels"].items())),
+            )
+        console.print(table)
+    fov = report["camera"]["fov"]
+    console.print(
+        f"renderer: {report['profile'] or 'not recognised'}; "
+        f"field of view: {f'{fov:.4g}°' if fov else 'unknown'}; "
+        f"worldToCamera: {'yes' if report['camera']['world_to_camera'] else 'no'}"
+    )
+
+    table = Table("attribute", "channels", "non-finite", "values")
+    for name, where in report["mapped"].items():
+        row = report["statistics"].get(name, {})
+        table.add_row(name, _safe(where), str(row.get("nonfinite", "")), _values(row))
+    for name, candidates in report["ambiguous"].items():
+        table.add_row(name, f"[yellow]ambiguous:[/yellow] {_safe(', '.join(candidates))}")
+    console.print(table)
+
+    table = Table("effect", "state", "derived", "missing")
+    for name, effect in report["effects"].items():
+        missing = [
+            f"{attribute}: {_safe(facts['why'])}"
+            + (f"; near: {_safe(', '.join(facts['near']))}" if facts["near"] else "")
+            for attribute, facts in effect["missing"].items()
+        ]
+        table.add_row(
+            name,
+            "[green]ready[/green]" if effect["ready"] else "[red]missing[/red]",
+            "\n".join(f"{key} {how}" for key, how in effect["derived"].items()),
+            "\n".join(missing),
+        )
+    console.print(table)
+
+
+def _values(row: Mapping[str, Any]) -> str:
+    if not row or row["min"] is None:
+        return "no finite value"
+    if row.get("depth"):
+        lowest, highest = row["depth"]
+        return f"{lowest:.4g} … {highest:.4g}, background {row['background']:,}"
+    text = f"{min(row['min']):.4g} … {max(row['max']):.4g}"
+    if row.get("length"):
+        lowest, highest = row["length"]
+        text += f", length {lowest:.4g} … {highest:.4g}, zero {row['zero']:,}"
+    return text
+
+
+def _safe(text: str) -> str:
+    """Text from a file: no markup, no control characters for the terminal to obey."""
+    from rich.markup import escape
+
+    return escape("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text))

@@ -1,0 +1,52 @@
+"""What this process may use of the machine: CPUs (also inside a container's quota) and memory."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+def cpu_quota(root: Path = _CGROUP) -> float | None:
+    """CPUs that the cgroup's quota allows (2.5 = two and a half), or None without a quota."""
+    try:  # cgroup v2
+        quota, period = (root / "cpu.max").read_text().split()[:2]
+    except (OSError, ValueError):
+        try:  # cgroup v1
+            quota = (root / "cpu/cpu.cfs_quota_us").read_text().strip()
+            period = (root / "cpu/cpu.cfs_period_us").read_text().strip()
+        except OSError:
+            return None
+    try:
+        cpus = float(quota) / float(period)
+    except (ValueError, ZeroDivisionError):  # "max": no quota
+        return None
+    return cpus if cpus > 0 else None
+
+
+@cache
+def cpu_count() -> int:
+    """CPUs this process may really use: its affinity, and the container's quota rounded up."""
+    try:
+        count = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS or Windows
+        count = os.cpu_count() or 1
+    quota = cpu_quota()
+    return max(1, count if quota is None else min(count, int(quota + 0.99)))
+
+
+def memory_bytes(root: Path = _CGROUP) -> int:
+    """Memory this process may use: the machine's, or the container's limit if that is less."""
+    total = 0
+    with suppress(AttributeError, ValueError, OSError):  # not on Windows
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for name in ("memory.max", "memory/memory.limit_in_bytes"):
+        try:
+            limit = int((root / name).read_text())
+        except (OSError, ValueError):
+            continue
+        return min(total, limit) if total else limit
+    return total

@@ -1,0 +1,236 @@
+"""How renderers name their channels, and in which space and handedness they write them.
+
+Each profile is one row of a table. Blender, Arnold, RenderMan, V-Ray and Unreal use fixed names;
+Mitsuba's are chosen by whoever wrote the scene, so its rows count only in files that say they
+come from Mitsuba, or when the profile is asked for. Depths of "planar" kind are measured along
+the view axis (attribute `depth`), those of "ray" kind along the ray (quantity `distance`).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepshade.attributes import ATTRIBUTES
+from deepshade.errors import ConfigError
+
+# What a file may hold beyond the attributes themselves; attributes are derived from them.
+QUANTITIES: dict[str, int] = {
+    **{name: len(attribute.channels) for name, attribute in ATTRIBUTES.items()},
+    "position_world": 3,  # world-space position
+    "distance": 1,  # depth along the ray
+    "alpha": 1,
+}
+
+Header = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A quantity, the layer names it goes by, and what turns the stored values into ours."""
+
+    quantity: str
+    layers: tuple[str, ...]
+    signs: tuple[int, ...] = ()
+    components: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """One renderer's conventions. `motion` says what a stored motion vector means."""
+
+    name: str
+    title: str
+    sources: tuple[Source, ...]
+    made_by: Callable[[Header], bool]
+    world: Literal["right", "left"] = "right"
+    camera: Literal["right", "left"] = "right"
+    depth: Literal["planar", "ray"] = "planar"
+    motion: str = "pixels"
+    unit: str = "scene units"
+    free_names: bool = False
+    fov: tuple[str, ...] = ()
+    matrix: Callable[[Header], NDArray[np.float64] | None] | None = None
+
+
+def profile(name: str) -> Profile:
+    """The profile of that name. Raises ConfigError naming the nearest one."""
+    if name not in PROFILES:
+        raise ConfigError(name, PROFILES, detail=f"unknown profile '{name}'")
+    return PROFILES[name]
+
+
+def detect(header: Header) -> Profile | None:
+    """The profile of the renderer that signed this header, or None."""
+    return next((p for p in PROFILES.values() if p.made_by(header)), None)
+
+
+def match_rank(layer: str, alias: str, *, from_stem: bool = False) -> int | None:
+    """How well a layer name fits an alias: 0 the same, 1 under a prefix, +2 in another case.
+
+    Prefixes end at a dot, slash or colon ("ViewLayer.Normal"), or at an underscore for aliases of
+    three letters and more ("shot_normal"); file stems (`from_stem`) may have any of those, and a
+    frame number at the end. None when it doesn't fit.
+    """
+    if from_stem:
+        layer = re.sub(r"[._\-\s]*\d+$", "", layer)
+        layer = re.sub(r"[_\-\s]+", ".", layer)
+        alias = alias.replace("_", ".")
+    lower, wanted = layer.lower(), alias.lower()
+    if not lower.endswith(wanted):
+        return None
+    prefix = layer[: len(layer) - len(alias)]
+    if prefix and prefix[-1] not in (".:/" if len(alias) < 3 else ".:/_"):
+        return None
+    return (1 if prefix else 0) + (0 if layer.endswith(alias) else 2)
+
+
+def _signed(*prefixes: str) -> Callable[[Header], bool]:
+    return lambda header: any(key.startswith(prefixes) for key in header)
+
+
+def _generated_by_mitsuba(header: Header) -> bool:
+    return "mitsuba" in str(header.get("generatedBy", "")).lower()
+
+
+def _blender(header: Header) -> bool:
+    return _signed("cycles.", "blender")(header) or str(header.get("File", "")).endswith(".blend")
+
+
+def _number(header: Header, *keys: str) -> float:
+    for key in keys:
+        try:
+            return float(header[key])
+        except (KeyError, TypeError, ValueError):
+            continue
+    return math.nan
+
+
+def _unreal_matrix(header: Header) -> NDArray[np.float64] | None:
+    """World (left-handed, z up, x forward at zero rotation, cm) to our camera space."""
+    place, turn = (
+        [_number(header, f"unreal/camera/{kind}/{axis}") for axis in axes]
+        for kind, axes in (("curPos", "xyz"), ("curRot", ("pitch", "yaw", "roll")))
+    )
+    if not np.isfinite(place + turn).all():
+        return None
+    (sp, sy, sr), (cp, cy, cr) = np.sin(np.radians(turn)), np.cos(np.radians(turn))
+    forward = (cp * cy, cp * sy, sp)
+    right = (sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, -sr * cp)
+    up = (-(cr * sp * cy + sr * sy), cy * sr - cr * sp * sy, cr * cp)
+    matrix = np.eye(4)
+    matrix[:3, :3] = right, up, np.negative(forward)
+    matrix[:3, 3] = -matrix[:3, :3] @ np.asarray(place)
+    return matrix
+
+
+_UP_TO_DOWN = (1, -1)  # image v points down
+_INTO_SCREEN = (1, 1, -1)  # a left-handed camera's z
+
+_CANONICAL = tuple(
+    Source(name, ("Z", "depth") if name == "depth" else (name,)) for name in ATTRIBUTES
+)
+
+_TABLE: Sequence[Profile] = (
+    Profile(
+        "deepshade",
+        "deepshade's own names",
+        (*_CANONICAL, Source("position_world", ("position_world",)), Source("alpha", ("A",))),
+        # its names are their own signature: header facts like deepshade:fov may be added to
+        # any renderer's file
+        lambda header: False,
+    ),
+    Profile(
+        "blender",
+        "Blender (Cycles, Eevee)",
+        (
+            Source("position_world", ("Position",)),
+            Source("normal_world", ("Normal",)),
+            Source("depth", ("Depth", "Z")),
+            Source("diffuse", ("DiffCol",)),
+            # X Y lead to the previous frame, Z W to the next; v up
+            Source("motion", ("Vector",), _UP_TO_DOWN, components="zw"),
+        ),
+        _blender,
+        motion="pixels to the next frame, v up",
+    ),
+    Profile(
+        "mitsuba",
+        "Mitsuba 3 (aov integrator)",
+        (
+            Source("position_world", ("position", "pos", "p")),
+            Source("normal_world", ("sh_normal", "normal", "nn", "n")),
+            Source("distance", ("depth", "dd.y", "dd")),
+            Source("diffuse", ("albedo",)),
+        ),
+        _generated_by_mitsuba,
+        depth="ray",
+        free_names=True,
+    ),
+    Profile(
+        "arnold",
+        "Arnold",
+        (
+            Source("position_world", ("P",)),
+            Source("normal_world", ("N",)),
+            Source("depth", ("Z",)),
+            Source("diffuse", ("diffuse_albedo",)),
+            Source("motion", ("motionvector",), _UP_TO_DOWN),
+        ),
+        _signed("arnold/"),
+        motion="pixels, v up",
+        fov=("CameraFov",),
+    ),
+    Profile(
+        "renderman",
+        "RenderMan",
+        (
+            Source("position_world", ("Pworld", "__Pworld")),
+            Source("normal_world", ("Nworld", "__Nworld")),
+            Source("normal", ("Nn", "__Nn"), _INTO_SCREEN),
+            Source("depth", ("z",)),
+            Source("motion", ("motionFore",), _UP_TO_DOWN),
+        ),
+        _signed("rman", "prman", "PixarRenderMan", "renderman"),
+        camera="left",
+        motion="pixels, v up",
+    ),
+    Profile(
+        "vray",
+        "V-Ray",
+        (
+            Source("normal", ("normals",)),
+            Source("depth", ("zDepth", "Z")),
+            Source("diffuse", ("diffuse_filter",)),
+            Source("motion", ("velocity",), _UP_TO_DOWN),
+        ),
+        _signed("vray", "VRay"),
+        motion="pixels, v up",
+    ),
+    Profile(
+        "unreal",
+        "Unreal Engine (Movie Render Queue)",
+        (
+            Source("normal_world", ("WorldNormal", "FinalImageWorldNormal")),
+            Source("position_world", ("WorldPosition", "FinalImageWorldPosition")),
+            Source(
+                "depth",
+                ("SceneDepth", "WorldDepth", "FinalImageSceneDepth", "FinalImageWorldDepth"),
+            ),
+            Source("diffuse", ("BaseColor", "FinalImageBaseColor")),
+        ),
+        _signed("unreal/"),
+        world="left",
+        unit="centimetres",
+        fov=("unreal/camera/FinalImage/fov", "unreal/camera/fov"),
+        matrix=_unreal_matrix,
+    ),
+)
+
+PROFILES: dict[str, Profile] = {row.name: row for row in _TABLE}
