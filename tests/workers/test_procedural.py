@@ -1,0 +1,58 @@
+"""Procedural scenes: made from seeds, closed, varied."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepshade_workers.procedural import FAMILIES, generate, primitives
+from deepshade_workers.procedural.interiors import curtain, random_cushion, vase
+from deepshade_workers.procedural.nature import leaf
+
+RNG = np.random.default_rng
+SOLIDS: dict[str, tuple[Any, float | None]] = {
+    "box": (primitives.box, 1.0),
+    "sphere": (lambda: primitives.sphere(4), np.pi / 6),
+    "cylinder": (lambda: primitives.cylinder(64), np.pi / 4),
+    "cone": (lambda: primitives.cone(64), np.pi / 12),
+    "torus": (lambda: primitives.torus(0.2, 64, 32), 2 * np.pi**2 * 0.4 * 0.1**2),
+    "rock": (lambda: primitives.rock(RNG(1)), None),
+    "blob": (lambda: primitives.blob(RNG(1), 0.4), None),
+    "tube": (lambda: primitives.tube(np.array([[0, 0, 0], [0, 1.0, 0]]), 0.1, 64), np.pi * 0.01),
+    "leaf": (lambda: leaf(RNG(1)), None),
+    "curtain": (lambda: curtain(RNG(1), 1, 1), None),
+    "vase": (lambda: vase(RNG(1)), None),
+    "cushion": (random_cushion, None),
+}
+
+
+def test_there_are_at_least_a_dozen_families() -> None:
+    assert len(FAMILIES) >= 12
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_solids_are_closed_and_face_outward(name: str) -> None:
+    make, expected = SOLIDS[name]
+    mesh = make()
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    volume = float(np.einsum("fk,fk->", a, np.cross(b, c)) / 6)
+    assert volume > 0
+    if expected is not None:
+        assert volume == pytest.approx(expected, rel=0.02)
+    # The area vectors of a closed surface add up to nothing.
+    assert np.abs(np.cross(b - a, c - a).sum(0)).max() < 1e-9
+    assert np.allclose(np.linalg.norm(mesh.normals, axis=2), 1)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_seed_makes_the_same_scene_and_another_seed_another(family: str) -> None:
+    first, again, other = generate(family, 7), generate(family, 7), generate(family, 8)
+    for name in ("vertices", "faces", "normals", "materials"):
+        assert (getattr(first, name) == getattr(again, name)).all()
+    assert first.vertices.shape != other.vertices.shape or (first.vertices != other.vertices).any()
+    assert np.isfinite(first.vertices).all()
+    assert len(first.faces) > 500
+    assert first.materials[:, :6].min() >= 0
+    assert first.materials[:, :6].max() <= 1

@@ -1,0 +1,1 @@
+"""Scenes, G-buffer and reference rendering, augmentation, shards and Ray jobs."""

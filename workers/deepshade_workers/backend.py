@@ -1,0 +1,42 @@
+"""Mitsuba, in the variant that this machine can run."""
+
+from __future__ import annotations
+
+import functools
+import os
+from typing import Any
+
+from deepshade.errors import DeepshadeError
+from deepshade.llvm import find_libllvm
+
+VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
+
+
+@functools.cache
+def mitsuba(variant: str | None = None) -> Any:
+    """Import Mitsuba and set its variant: `cuda_ad_rgb` where there is a GPU, else `llvm_ad_rgb`.
+
+    Raises:
+        DeepshadeError: there is neither an NVIDIA GPU nor a usable libLLVM.
+    """
+    library = find_libllvm()
+    if library is not None:
+        os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(library))
+    import mitsuba as mi
+
+    if variant is None:
+        variant = "cuda_ad_rgb" if _has_gpu() else "llvm_ad_rgb"
+    if variant == "llvm_ad_rgb" and library is None:
+        raise DeepshadeError(
+            "Mitsuba's llvm_ad_rgb variant needs libLLVM 17 or newer, and none was found",
+            fix="apt-get install libllvm19, or set DRJIT_LIBLLVM_PATH to a libLLVM shared library",
+        )
+    mi.set_variant(variant)
+    mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+def _has_gpu() -> bool:
+    import drjit as dr
+
+    return bool(dr.has_backend(dr.JitBackend.CUDA))

@@ -1,0 +1,220 @@
+"""`deepshade render` and `deepshade datagen`."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+Vector = tuple[float, float, float]
+
+
+def render(
+    scene: Annotated[
+        str,
+        typer.Argument(help="OBJ, PLY, glTF, GLB, Mitsuba XML, or procedural:<family>:<seed>."),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="EXR file to write.")],
+    eye: Annotated[Vector, typer.Option(help="The camera's place, scene units.")],
+    target: Annotated[Vector, typer.Option(help="What it looks at.")],
+    up: Annotated[Vector, typer.Option(help="Upward direction.")] = (0.0, 1.0, 0.0),
+    fov: Annotated[float, typer.Option(help="Full horizontal angle, degrees.")] = 50.0,
+    size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "768x512",
+    effects: Annotated[str, typer.Option(help="References to render, commas between.")] = "ao",
+    radius: Annotated[
+        float | None, typer.Option(help="Effect radius, scene units.  [default: diagonal / 20]")
+    ] = None,
+    spp: Annotated[int, typer.Option(help="Reference rays a pixel.", min=2, max=65536)] = 256,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    focus: Annotated[
+        float | None, typer.Option(help="Focus distance.  [default: that of the target]")
+    ] = None,
+    aperture: Annotated[float, typer.Option(help="Lens diameter, scene units.", min=0)] = 0.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """Render a view: every canonical attribute, the camera, and the references of EFFECTS.
+
+    Example:
+
+      deepshade render teapot.obj -o out.exr --eye 0 3 6 --target 0 1 0 --radius 0.5
+    """
+    import math
+
+    from deepshade.camera import Camera
+    from deepshade.errors import ConfigError
+
+    from .loading import open_scene
+    from .render import render as render_view
+
+    if radius is not None and not (math.isfinite(radius) and radius > 0):
+        raise ConfigError("radius", detail=f"the radius must be above 0, not {radius}")
+    names = _known([name.strip() for name in effects.split(",") if name.strip()])
+    width, height = _size(size)
+    camera = Camera.look_at(eye, target, up, fov, width, height)
+    opened = open_scene(scene)
+    figures = render_view(
+        opened,
+        camera,
+        output,
+        effects=names,
+        radius=opened.diagonal / 20 if radius is None else radius,
+        samples=spp,
+        seed=seed,
+        focus=math.dist(eye, target) if focus is None else focus,
+        aperture=aperture,
+    )
+    if as_json:
+        typer.echo(json.dumps(figures))
+        return
+    typer.echo(f"{output}: {width}x{height} in {figures['seconds']} s")
+    for name in names:
+        found = figures[name]
+        typer.echo(
+            f"  {name}: mean {found['mean']}, contrast {found['contrast']}, "
+            f"standard error {found['error']}"
+        )
+
+
+def _size(text: str) -> tuple[int, int]:
+    from deepshade.errors import ConfigError
+
+    width, _, height = text.lower().partition("x")
+    if not (width.isdigit() and height.isdigit()) or not (
+        1 <= int(width) <= 16384 and 1 <= int(height) <= 16384
+    ):
+        raise ConfigError("size", detail=f"--size {text!r} must be like 768x512, up to 16384")
+    return int(width), int(height)
+
+
+def datagen(
+    out: Annotated[Path, typer.Option(help="Folder of the data set; an unfinished one goes on.")],
+    scenes: Annotated[
+        list[str],
+        typer.Option(help="Scene file, folder, 'procedural' or 'procedural:<family>'; repeatable."),
+    ],
+    views: Annotated[int, typer.Option(help="Samples in all.", min=1)] = 256,
+    size: Annotated[int, typer.Option(help="Side of a sample, pixels.", min=8, max=4096)] = 256,
+    frame: Annotated[
+        int | None,
+        typer.Option(help="Side of the view that samples are cut from.  [default: size]"),
+    ] = None,
+    spp: Annotated[int, typer.Option(help="Reference rays a pixel.", min=2)] = 256,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    effects: Annotated[list[str] | None, typer.Option(help="Effects; repeatable.")] = None,
+    radius: Annotated[
+        float | None, typer.Option(help="Effect radius, scene units.  [default: drawn per view]")
+    ] = None,
+    min_contrast: Annotated[
+        float, typer.Option(help="Least standard deviation of a view's occlusion.")
+    ] = 0.06,
+    shard_size: Annotated[int, typer.Option(help="Samples in a shard.", min=1)] = 128,
+    address: Annotated[
+        str | None, typer.Option(help="A running Ray cluster.  [default: one of its own]")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON summary.")] = False,
+) -> None:
+    """Render a data set of random views on Ray.
+
+    Run the same command again to go on after an interruption. Examples:
+
+      deepshade datagen --out data/ao --scenes procedural --views 2048
+
+      ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
+    """
+    from .datagen import Job, expand_scenes, generate, rate
+
+    job = Job(
+        scenes=expand_scenes(scenes),
+        views=views,
+        effects=tuple(_known(effects or ["ao"])),
+        size=size,
+        frame=frame or size,
+        spp=spp,
+        seed=seed,
+        radius=radius,
+        min_contrast=min_contrast,
+        shard_size=shard_size,
+    )
+    begun, start, done = time.monotonic(), None, 0
+    with _progress(hidden=as_json) as report:
+        for done, total in generate(job, out, address=address):
+            start = done if start is None else start
+            report(done, total)
+    fresh = done - (start or 0)
+    summary = {
+        "out": str(out),
+        "views": done,
+        "rendered": fresh,
+        "seconds": round(time.monotonic() - begun, 2),
+        "views_per_second": round(rate(fresh, begun), 3),
+    }
+    typer.echo(json.dumps(summary) if as_json else f"{done} views in {out}, {fresh} of them new")
+
+
+def _known(effects: list[str]) -> list[str]:
+    from deepshade.errors import ConfigError
+
+    from .reference import REFERENCES
+
+    for effect in effects:
+        if effect not in REFERENCES:
+            raise ConfigError(
+                effect,
+                REFERENCES,
+                detail=f"no reference for {effect!r}; there are: {', '.join(REFERENCES)}",
+            )
+    return effects
+
+
+class _progress:
+    """A bar with rate and time left on a terminal, a line every 15 s elsewhere."""
+
+    def __init__(self, *, hidden: bool) -> None:
+        from rich.console import Console
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        self.console = Console(stderr=True)
+        self.plain = not self.console.is_terminal
+        self.hidden = hidden
+        self.last = self.begun = time.monotonic()
+        self.first: int | None = None
+        self.bar = Progress(
+            TextColumn("rendering"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=self.plain or hidden,
+        )
+        self.task = self.bar.add_task("", total=None, rate="")
+
+    def __enter__(self) -> Any:
+        self.bar.start()
+        return self.report
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.stop()
+
+    def report(self, done: int, total: int) -> None:
+        from .datagen import rate
+
+        self.first = done if self.first is None else self.first
+        speed = rate(done - self.first, self.begun)
+        self.bar.update(self.task, completed=done, total=total, rate=f"{speed:.2f}/s")
+        now = time.monotonic()
+        if self.plain and not self.hidden and now - self.last > 15:
+            self.last = now
+            left = f"{(total - done) / speed / 60:.1f} min left" if speed else ""
+            self.console.print(f"rendering {done}/{total}  {speed:.2f}/s  {left}", style=None)

@@ -1,0 +1,306 @@
+"""Renders a data set on Ray: one task a shard, resumable, the same bytes for the same seed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepshade.errors import ConfigError, DataError, SceneError
+from deepshade.manifest import NAME, Manifest, Shard
+
+from .loading import PROCEDURAL, SUFFIXES, parse_procedural
+from .procedural import FAMILIES
+from .shards import Images, schema, shard_name, write_shard
+
+# How often a sample whose scene shows nothing may ask for another scene.
+SCENE_TRIES = 16
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a data set holds; two equal jobs make equal bytes.
+
+    `scenes` are files, or `procedural:<family>`; `size` is a sample's side and `frame` that of
+    the view it is cut from, in pixels; `radius` None draws one for each view.
+    """
+
+    scenes: tuple[str, ...]
+    views: int
+    effects: tuple[str, ...] = ("ao",)
+    size: int = 256
+    frame: int = 512
+    spp: int = 256
+    seed: int = 0
+    radius: float | None = None
+    min_contrast: float = 0.06
+    shard_size: int = 128
+
+    def __post_init__(self) -> None:
+        for key in ("views", "size", "spp", "shard_size"):
+            if getattr(self, key) < 1:
+                raise ConfigError(key, detail=f"{key} must be at least 1, not {getattr(self, key)}")
+        if self.frame < self.size:
+            raise ConfigError(
+                "frame", detail=f"frame {self.frame} is smaller than size {self.size}"
+            )
+        if self.seed < 0:
+            raise ConfigError("seed", detail=f"the seed must be 0 or more, not {self.seed}")
+        if not self.scenes:
+            raise ConfigError("scenes", detail="no scenes were given: --scenes procedural, say")
+
+    @property
+    def shards(self) -> int:
+        """How many shards hold all views."""
+        return -(-self.views // self.shard_size)
+
+    def samples(self, shard: int) -> range:
+        """The sample numbers of a shard."""
+        return range(shard * self.shard_size, min(self.views, (shard + 1) * self.shard_size))
+
+    def settings(self) -> dict[str, Any]:
+        """JSON-ready settings, for the manifest."""
+        return {**asdict(self), "scenes": list(self.scenes), "effects": list(self.effects)}
+
+
+def expand_scenes(names: list[str]) -> tuple[str, ...]:
+    """`procedural` becomes all families, folders become the scene files in them.
+
+    Raises:
+        SceneError: a name fits nothing.
+    """
+    found: list[str] = []
+    for name in names:
+        if name == PROCEDURAL:
+            found += [f"{PROCEDURAL}:{family}" for family in FAMILIES]
+        elif name.startswith(f"{PROCEDURAL}:"):
+            parse_procedural(name)
+            found.append(name)
+        elif Path(name).is_dir():
+            inside = sorted(p for p in Path(name).iterdir() if p.suffix.lower() in SUFFIXES)
+            if not inside:
+                raise SceneError(f"the folder {name} holds no scene files")
+            found += [str(p) for p in inside]
+        elif Path(name).is_file() and Path(name).suffix.lower() in SUFFIXES:
+            found.append(name)
+        else:
+            raise SceneError(
+                f"there is no scene {name!r}",
+                fix=f"give a file ({', '.join(sorted(SUFFIXES))}), a folder or 'procedural'",
+            )
+    return tuple(found)
+
+
+def make_sample(job: Job, index: int) -> tuple[Images, dict[str, Any]]:
+    """Render sample `index`: its images and the record that makes it again.
+
+    The sample's own random stream picks scene, view, radius and noise, so it doesn't matter
+    which worker renders it, or when.
+    """
+    from .loading import open_scene
+    from .sample import render_sample
+    from .views import sample_view
+
+    rng = np.random.default_rng([job.seed, index])
+    choice = job.scenes[index % len(job.scenes)]
+    for attempt in range(SCENE_TRIES):
+        fresh = choice.startswith(PROCEDURAL) and choice.count(":") == 1
+        name = f"{choice}:{int(rng.integers(2**31))}" if fresh else choice
+        scene = open_scene(name)
+        try:
+            view = sample_view(
+                scene,
+                rng,
+                frame=job.frame,
+                size=job.size,
+                radius=job.radius,
+                min_contrast=job.min_contrast,
+            )
+            break
+        except SceneError:
+            if not fresh or attempt == SCENE_TRIES - 1:
+                raise
+    noise = int(rng.integers(2**63))
+    images, _ = render_sample(
+        scene,
+        view.camera,
+        job.size,
+        job.size,
+        effects=job.effects,
+        radius=view.radius,
+        samples=job.spp,
+        seed=noise,
+    )
+    camera = view.camera
+    record = {
+        "scene": name,
+        "seed": noise,
+        "radius": view.radius,
+        "camera": {
+            "fov": camera.fov,
+            "frame": [camera.width, camera.height],
+            "origin": [camera.x0, camera.y0],
+            "world_to_camera": camera.matrix.tolist(),
+        },
+    }
+    return images, record
+
+
+def make_shard(job: Job, index: int, folder: Path, tick: Callable[[], object]) -> Shard:
+    """Render and write shard `index`; calls `tick` after each sample."""
+    tensors = list(schema(job.effects, job.size))
+    images, records = [], []
+    for number in job.samples(index):
+        sample, record = make_sample(job, number)
+        images.append({name: sample[name] for name in tensors})
+        records.append(record)
+        tick()
+    return write_shard(folder, index, tensors, images, records)
+
+
+def open_manifest(job: Job, folder: Path) -> Manifest:
+    """The manifest to go on with: that of `folder` if the same job made it, else a new one.
+
+    A data set may grow: more views than it was begun with are the same job.
+
+    Raises:
+        DataError: the folder holds a data set of other settings.
+    """
+    if not (folder / NAME).exists():
+        return Manifest(job.settings(), schema(job.effects, job.size))
+    manifest = Manifest.read(folder)
+    theirs, ours = manifest.settings, job.settings()
+    differing = [key for key in ours if theirs.get(key) != ours[key]]
+    if differing == ["views"] and theirs["views"] < job.views:
+        return Manifest(ours, manifest.schema, manifest.shards)
+    if differing:
+        was = ", ".join(f"{key} {theirs.get(key)!r}" for key in differing)
+        raise DataError(
+            f"{folder} holds a data set made with other settings: {was}",
+            fix="give the same settings to complete it, or another --out",
+        )
+    return manifest
+
+
+def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[tuple[int, int]]:
+    """Render what is missing of `job` into `folder` on a Ray cluster.
+
+    `address` is a running cluster's; None takes RAY_ADDRESS, or else starts a cluster in this
+    process. All nodes must see `folder` under the same path. Yields (samples done, samples in
+    all) a few times a second. A killed worker's shard is rendered anew by another.
+
+    Raises:
+        DataError: the folder holds another data set.
+        SceneError: a scene can't be read or shows nothing.
+    """
+    import ray
+
+    folder = folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    manifest = open_manifest(job, folder)
+    missing = [k for k in range(job.shards) if not _complete(job, k, manifest, folder)]
+    ready = job.views - sum(len(job.samples(k)) for k in missing)
+    yield ready, job.views
+    if not missing:
+        return
+    _connect(address)
+    try:
+        tally = ray.remote(num_cpus=0)(Tally).remote()
+        task = ray.remote(num_cpus=1, max_retries=5)(_shard_task)
+        # A few at a time: a kill then loses little, and the cluster's memory stays flat.
+        slots = max(1, 2 * int(ray.cluster_resources().get("CPU", 1)))
+        running: list[Any] = []
+        waiting = iter(missing)
+        while True:
+            for k in waiting:
+                running.append(task.remote(job, k, str(folder), tally))
+                if len(running) >= slots:
+                    break
+            if not running:
+                break
+            finished, running = ray.wait(running, num_returns=1, timeout=0.5)
+            for reference in finished:
+                manifest = manifest.with_shard(_result(reference))
+                manifest.write(folder)
+            yield min(ready + ray.get(tally.total.remote()), job.views), job.views
+        yield job.views, job.views
+    finally:
+        ray.shutdown()
+
+
+def _complete(job: Job, index: int, manifest: Manifest, folder: Path) -> bool:
+    return any(
+        shard.file == shard_name(index)
+        and len(shard.samples) == len(job.samples(index))
+        and (folder / shard.file).exists()
+        for shard in manifest.shards
+    )
+
+
+class Tally:
+    """Counts rendered samples across the cluster; a shard begun again counts once."""
+
+    def __init__(self) -> None:
+        self.counts: dict[int, int] = {}
+
+    def set(self, shard: int, count: int) -> None:
+        """Shard `shard` has `count` samples now."""
+        self.counts[shard] = count
+
+    def total(self) -> int:
+        """Samples rendered in all."""
+        return sum(self.counts.values())
+
+
+def _shard_task(job: Job, index: int, folder: str, tally: Any) -> Shard:
+    import drjit as dr
+
+    from .backend import mitsuba
+
+    mitsuba()
+    dr.set_thread_count(1)  # Ray gave this task one core
+    count = 0
+
+    def tick() -> None:
+        nonlocal count
+        count += 1
+        tally.set.remote(index, count)
+
+    return make_shard(job, index, Path(folder), tick)
+
+
+def _result(reference: Any) -> Shard:
+    import ray
+
+    try:
+        shard: Shard = ray.get(reference)
+        return shard
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause if isinstance(error.cause, SceneError) else error from None
+
+
+def _connect(address: str | None) -> None:
+    import ray
+
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    where = address or os.environ.get("RAY_ADDRESS") or "local"
+    options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    if where == "local":
+        options |= {"include_dashboard": False}
+    try:
+        ray.init(address=where, **options)
+    except ConnectionError as error:
+        raise DataError(
+            f"there is no Ray cluster at {where}: {error}",
+            fix="start one with 'ray start --head', or leave --address out",
+        ) from error
+
+
+def rate(done: int, since: float) -> float:
+    """Samples a second since the time `since` (time.monotonic)."""
+    return done / max(time.monotonic() - since, 1e-9)

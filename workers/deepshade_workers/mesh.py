@@ -1,0 +1,122 @@
+"""Triangle meshes with Phong materials: the geometry that every scene is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Material:
+    """Phong reflectances in [0, 1], exponent and scattering mean free path (scene units)."""
+
+    diffuse: tuple[float, float, float] = (0.7, 0.7, 0.7)
+    specular: tuple[float, float, float] = (0.04, 0.04, 0.04)
+    gloss: float = 16.0
+    scatter: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def row(self) -> Floats:
+        """(10,) values in the order of `Mesh.materials`."""
+        return np.array([*self.diffuse, *self.specular, self.gloss, *self.scatter])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles with a normal per corner.
+
+    `vertices` (V, 3), `faces` (F, 3) indices, `normals` (F, 3, 3) one unit normal per corner,
+    `materials` (F, 10) rows of `Material.row`. Counter-clockwise faces look outward.
+    """
+
+    vertices: Floats
+    faces: Ints
+    normals: Floats
+    materials: Floats = field(repr=False)
+
+    @classmethod
+    def build(
+        cls,
+        vertices: Floats,
+        faces: Ints,
+        *,
+        crease: float = 30.0,
+        material: Material | None = None,
+        vertex_normals: Floats | None = None,
+    ) -> Mesh:
+        """Make a mesh, dropping degenerate and non-finite triangles.
+
+        Without `vertex_normals` (V, 3), edges sharper than `crease` degrees stay sharp; 0 gives
+        flat faces and 180 smooths everything.
+        """
+        vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
+        faces = np.asarray(faces, np.int64).reshape(-1, 3)
+        cross = _face_cross(vertices, faces)
+        area = np.linalg.norm(cross, axis=1)
+        keep = np.isfinite(area) & (area > 0)
+        faces, cross, area = faces[keep], cross[keep], area[keep]
+        flat = cross / area[:, None]
+        if vertex_normals is not None:
+            corner = np.asarray(vertex_normals, np.float64)[faces]
+        elif crease <= 0:
+            corner = np.repeat(flat[:, None], 3, axis=1)
+        else:
+            corner = _smooth(len(vertices), faces, cross)
+            sharp = np.einsum("fck,fk->fc", corner, flat) < np.cos(np.radians(crease))
+            corner = np.where(sharp[..., None], flat[:, None], corner)
+        length = np.linalg.norm(corner, axis=2, keepdims=True)
+        good = np.isfinite(length) & (length > 1e-8)
+        corner = np.where(good, corner / np.where(good, length, 1), flat[:, None])
+        rows = np.tile((material or Material()).row(), (len(faces), 1))
+        return cls(vertices, faces, corner, rows)
+
+    def transformed(self, matrix: Floats) -> Mesh:
+        """Apply a (4, 4) affine `matrix`; normals follow the inverse transpose."""
+        linear = matrix[:3, :3]
+        vertices = self.vertices @ linear.T + matrix[:3, 3]
+        mirrored = np.linalg.det(linear) < 0
+        normals = self.normals @ np.linalg.inv(linear)
+        normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-30)
+        if mirrored:
+            return Mesh(vertices, self.faces[:, ::-1], normals[:, ::-1], self.materials)
+        return Mesh(vertices, self.faces, normals, self.materials)
+
+    def with_material(self, material: Material) -> Mesh:
+        """The same triangles made of one `material`."""
+        rows = np.tile(material.row(), (len(self.faces), 1))
+        return Mesh(self.vertices, self.faces, self.normals, rows)
+
+
+def merge(meshes: Iterable[Mesh]) -> Mesh:
+    """Join meshes into one, so that a ray tracer sees a single shape."""
+    parts = list(meshes)
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]),
+        np.concatenate([part.normals for part in parts]),
+        np.concatenate([part.materials for part in parts]),
+    )
+
+
+def _face_cross(vertices: Floats, faces: Ints) -> Floats:
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _smooth(count: int, faces: Ints, cross: Floats) -> Floats:
+    """Area-weighted vertex normals, per corner (F, 3, 3)."""
+    total = np.stack(
+        [
+            np.bincount(faces.ravel(), weights=np.repeat(cross[:, k], 3), minlength=count)
+            for k in range(3)
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray((total / np.where(length > 0, length, 1))[faces])
