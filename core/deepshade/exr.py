@@ -172,8 +172,8 @@ def fetch(source: Path | str | bytes, limits: Limits) -> bytes:
     Read once, so that what was checked is what gets decoded; not mapped, because a mapped file
     that someone truncates meanwhile kills the process.
     """
-    if isinstance(source, bytes):
-        return source
+    if isinstance(source, (bytes, bytearray, memoryview)):
+        return bytes(source)  # no copy of what is bytes already
     path = Path(source)
     try:
         limits.check("body_bytes", path.stat().st_size)

@@ -106,10 +106,11 @@ class Plan:
         missing = [name for name in lacking if not unmet[name]]
         if missing:
             raise channels.missing(self.layers, missing, {})
-        first = lacking[0]
+        wanted = list(dict.fromkeys(need for name in lacking for need in unmet[name]))
         raise CameraError(
-            f"'{first}' can be derived, but that {self.explain(first)}",
-            fix="; ".join(derivation.REQUIREMENT_FIXES[name] for name in unmet[first]),
+            f"{', '.join(map(repr, lacking))} could be derived from what is there, but that needs "
+            f"{derivation.requirement_text(wanted)}",
+            fix="; ".join(derivation.REQUIREMENT_FIXES[name] for name in wanted),
         )
 
 

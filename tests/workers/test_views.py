@@ -34,9 +34,7 @@ def test_views_show_something_from_outside(name: str) -> None:
 
 def test_the_same_stream_gives_the_same_view() -> None:
     scene = open_scene("procedural:stairs:1")
-    a, b = (
-        sample_view(scene, np.random.default_rng(5), frame=128, size=64) for _ in range(2)
-    )
+    a, b = (sample_view(scene, np.random.default_rng(5), frame=128, size=64) for _ in range(2))
     assert a == b
     assert (a.camera.matrix == b.camera.matrix).all()
 

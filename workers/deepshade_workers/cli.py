@@ -33,6 +33,9 @@ def render(
         float | None, typer.Option(help="Focus distance.  [default: that of the target]")
     ] = None,
     aperture: Annotated[float, typer.Option(help="Lens diameter, scene units.", min=0)] = 0.0,
+    attributes: Annotated[
+        str, typer.Option(help="Attributes to write, commas between.  [default: all]")
+    ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Render a view: every canonical attribute, the camera, and the references of EFFECTS.
@@ -65,6 +68,7 @@ def render(
         seed=seed,
         focus=math.dist(eye, target) if focus is None else focus,
         aperture=aperture,
+        attributes=_attributes(attributes),
     )
     if as_json:
         typer.echo(json.dumps(figures))
@@ -76,6 +80,17 @@ def render(
             f"  {name}: mean {found['mean']}, contrast {found['contrast']}, "
             f"standard error {found['error']}"
         )
+
+
+def _attributes(text: str) -> tuple[str, ...] | None:
+    from deepshade.attributes import ATTRIBUTES
+    from deepshade.errors import ConfigError
+
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in names:
+        if name not in ATTRIBUTES:
+            raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called {name!r}")
+    return names or None
 
 
 def _size(text: str) -> tuple[int, int]:

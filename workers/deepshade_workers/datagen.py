@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -210,17 +211,16 @@ def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[
         return
     _connect(address)
     try:
-        tally = ray.remote(num_cpus=0)(Tally).remote()
+        tally: Any = ray.remote(num_cpus=0)(Tally)
+        tally = tally.remote()
         task = ray.remote(num_cpus=1, max_retries=5)(_shard_task)
         # A few at a time: a kill then loses little, and the cluster's memory stays flat.
-        slots = max(1, 2 * int(ray.cluster_resources().get("CPU", 1)))
+        slots = max(1, 2 * int(_resources().get("CPU", 1)))
         running: list[Any] = []
         waiting = iter(missing)
         while True:
-            for k in waiting:
+            for k in itertools.islice(waiting, slots - len(running)):
                 running.append(task.remote(job, k, str(folder), tally))
-                if len(running) >= slots:
-                    break
             if not running:
                 break
             finished, running = ray.wait(running, num_returns=1, timeout=0.5)
@@ -299,6 +299,13 @@ def _connect(address: str | None) -> None:
             f"there is no Ray cluster at {where}: {error}",
             fix="start one with 'ray start --head', or leave --address out",
         ) from error
+
+
+def _resources() -> dict[str, float]:
+    import ray
+
+    found: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+    return found
 
 
 def rate(done: int, since: float) -> float:

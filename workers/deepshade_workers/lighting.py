@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -17,62 +18,101 @@ mi = mitsuba()
 
 # Irradiance of the camera's lamp on a surface that faces it at the view's median depth.
 LAMP = 1.5
+# The end of rays to lights without a distance: the largest float32.
+FARTHEST = float(np.finfo(np.float32).max)
 # Streams of other references must not repeat here.
 STREAM = 0x6C696768
 
 
-@dr.syntax
+@dataclass(frozen=True)
+class Phong:
+    """The surface at the hits, in its shading frame: R_diff/π + R_spec (n + 2)/(2π) cosⁿα.
+
+    α is the angle between the mirrored view and the light (normalised; Lafortune and Willems,
+    "Using the modified Phong reflectance model", 1994).
+    """
+
+    frame: Any
+    mirrored: Any
+    diffuse: Any
+    specular: Any
+    gloss: Any
+
+    @classmethod
+    def at(cls, hits: Hits) -> Phong:
+        """Evaluate the materials of `hits`."""
+        frame = mi.Frame3f(hits.ns)
+        return cls(
+            frame,
+            mi.reflect(frame.to_local(toward_camera(hits))),
+            material(hits, "diffuse", 3),
+            material(hits, "specular", 3),
+            material(hits, "gloss", 1),
+        )
+
+    def shine(self, local: Any) -> Any:
+        """The specular part toward the camera for light from `local`."""
+        lobe = dr.power(dr.maximum(dr.dot(local, self.mirrored), 1e-6), self.gloss)
+        return self.specular * (self.gloss + 2) * dr.inv_two_pi * lobe
+
+
 def direct_light(
     scene: Scene, hits: Hits, *, samples: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Radiance toward the camera after one bounce of the lights: L and its diffuse part L_diff.
 
-    Both are (3, N), linear. The surface is Phong's: diffuse R_diff/π, and R_spec (n + 2)/(2π)
-    cosⁿα with α between the mirrored view and the light (normalised; Lafortune and Willems 1994).
-    A scene without lights of its own has the default sun and sky, and a lamp at the camera so
-    that closed rooms aren't black. Pixels without a hit hold 0.
+    Both are (3, N), linear; pixels without a hit hold 0. A scene without lights of its own has
+    the default sun and sky, and a lamp at the camera so that closed rooms aren't black.
     """
+    phong = Phong.at(hits)
+    part, shone = _sample_lights(scene, hits, phong, samples, seed)
+    if not scene.lit and hits.valid.numpy().any():
+        # No shadow ray: whatever the camera sees, a lamp at the camera lights.
+        local = phong.frame.to_local(toward_camera(hits))
+        median = float(np.median(hits.depth.numpy()[hits.valid.numpy()]))
+        arriving = LAMP * dr.square(median / hits.surface.t) * dr.maximum(local.z, 0)
+        part += phong.diffuse * dr.inv_pi * arriving
+        shone += phong.shine(local) * arriving
+    return _image(part + shone, hits), _image(part, hits)
+
+
+def toward_camera(hits: Hits) -> Any:
+    """Unit world-space directions from the hits to the camera."""
+    return hits.surface.to_world(hits.surface.wi)
+
+
+@dr.syntax
+def _sample_lights(
+    scene: Scene, hits: Hits, phong: Phong, samples: int, seed: int
+) -> tuple[Any, Any]:
+    """Mean diffuse and specular radiance over `samples` light samples with shadow rays."""
     stream = pixel_streams(len(hits.valid), seed ^ STREAM)
-    origin = offset_origin(hits.p, hits.ng, scene)
-    frame = mi.Frame3f(hits.ns)
-    diffuse = material(hits, "diffuse", 3)
-    specular = material(hits, "specular", 3)
-    gloss = material(hits, "gloss", 1)
-    mirrored = mi.reflect(frame.to_local(hits.surface.to_world(hits.surface.wi)))
-    reference = mi.SurfaceInteraction3f(hits.surface)
-    reference.p = origin
-    traced, valid = scene.traced, hits.valid
+    start = mi.SurfaceInteraction3f(hits.surface)
+    start.p = offset_origin(hits.p, hits.ng, scene)
+    traced, valid, frame = scene.traced, hits.valid, phong.frame
     count = dr.opaque(mi.UInt32, samples)
 
-    index = mi.UInt32(0)
-    lit = mi.Color3f(0)
-    shone = mi.Color3f(0)
-    while index < count:
+    def lights(index: Any) -> tuple[Any, Any]:
         light, radiance = traced.sample_emitter_direction(
-            reference, random_pair(stream, index), False, valid
+            start, random_pair(stream, index), False, valid
         )
         local = frame.to_local(light.d)
         seen = valid & (light.pdf > 0) & (local.z > 0)
-        reach = dr.select(light.dist < dr.inf, light.dist * (1 - 1e-4), dr.largest(mi.Float))
-        ray = mi.Ray3f(origin, light.d, reach, 0.0, [])
+        reach = dr.select(light.dist < dr.inf, light.dist * (1 - 1e-4), FARTHEST)
+        ray = mi.Ray3f(start.p, light.d, reach, 0.0, [])
         seen &= ~traced.ray_test(ray, seen)
         arriving = dr.select(seen, radiance * local.z, 0)
-        lobe = dr.power(dr.maximum(dr.dot(local, mirrored), 1e-6), gloss)
-        lit += diffuse * dr.inv_pi * arriving
-        shone += specular * (gloss + 2) * dr.inv_two_pi * lobe * arriving
-        index += 1
+        return phong.diffuse * dr.inv_pi * arriving, phong.shine(local) * arriving
 
-    part = lit / samples
-    whole = part + shone / samples
-    if not scene.lit and dr.any(valid):
-        # No shadow ray: whatever the camera sees, a lamp at the camera lights.
-        local = frame.to_local(hits.surface.to_world(hits.surface.wi))
-        median = float(np.median(hits.depth.numpy()[valid.numpy()]))
-        arriving = LAMP * dr.square(median / hits.surface.t) * dr.maximum(local.z, 0)
-        lobe = dr.power(dr.maximum(dr.dot(local, mirrored), 1e-6), gloss)
-        part += diffuse * dr.inv_pi * arriving
-        whole += (diffuse * dr.inv_pi + specular * (gloss + 2) * dr.inv_two_pi * lobe) * arriving
-    return _image(whole, hits), _image(part, hits)
+    index = mi.UInt32(0)
+    part = mi.Color3f(0)
+    shone = mi.Color3f(0)
+    while index < count:
+        more, brighter = lights(index)
+        part += more
+        shone += brighter
+        index += 1
+    return part / samples, shone / samples
 
 
 def _image(colour: Any, hits: Hits) -> NDArray[np.float32]:

@@ -69,7 +69,7 @@ def load_mesh(path: Path) -> Mesh:
             fix=f"known formats: {', '.join(sorted(SUFFIXES))}",
         )
     try:
-        loaded = trimesh.load_scene(path, process=False, maintain_order=True)
+        loaded = trimesh.load_scene(path, process=False)
         parts = [
             part for part in loaded.dump(concatenate=False) if isinstance(part, trimesh.Trimesh)
         ]

@@ -66,9 +66,7 @@ class Mesh:
         elif crease <= 0:
             corner = np.repeat(flat[:, None], 3, axis=1)
         else:
-            corner = _smooth(len(vertices), faces, cross)
-            sharp = np.einsum("fck,fk->fc", corner, flat) < np.cos(np.radians(crease))
-            corner = np.where(sharp[..., None], flat[:, None], corner)
+            corner = _smooth(faces, cross, flat, float(np.cos(np.radians(min(crease, 180)))))
         length = np.linalg.norm(corner, axis=2, keepdims=True)
         good = np.isfinite(length) & (length > 1e-8)
         corner = np.where(good, corner / np.where(good, length, 1), flat[:, None])
@@ -109,14 +107,21 @@ def _face_cross(vertices: Floats, faces: Ints) -> Floats:
     return np.asarray(np.cross(b - a, c - a))
 
 
-def _smooth(count: int, faces: Ints, cross: Floats) -> Floats:
-    """Area-weighted vertex normals, per corner (F, 3, 3)."""
-    total = np.stack(
-        [
-            np.bincount(faces.ravel(), weights=np.repeat(cross[:, k], 3), minlength=count)
-            for k in range(3)
-        ],
-        axis=1,
-    )
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.asarray((total / np.where(length > 0, length, 1))[faces])
+def _smooth(faces: Ints, cross: Floats, flat: Floats, least: float) -> Floats:
+    """Corner normals (F, 3, 3): the area-weighted mean over the faces around a corner's vertex.
+
+    Only faces count whose own normal has a cosine of at least `least` with the corner's face.
+    """
+    corners = faces.ravel()
+    order = np.argsort(corners, kind="stable")
+    _, start, degree = np.unique(corners[order], return_index=True, return_counts=True)
+    total = np.zeros((len(corners), 3))
+    # Vertices of equal degree at once: all pairs of their corners, as one (n, d, d) block.
+    for d in np.unique(degree):
+        first = start[degree == d]
+        for chunk in np.array_split(first, max(1, len(first) * d * d // 2_000_000)):
+            around = order[chunk[:, None] + np.arange(d)]  # (n, d) corners of each vertex
+            face = around // 3
+            near = np.einsum("nak,nbk->nab", flat[face], flat[face]) >= least - 1e-9
+            total[around.ravel()] = np.einsum("nab,nbk->nak", near, cross[face]).reshape(-1, 3)
+    return total.reshape(-1, 3, 3)

@@ -35,9 +35,11 @@ def render(
     seed: int,
     focus: float,
     aperture: float = 0.0,
+    attributes: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Render `scene` through `camera` and write `target`; returns figures for a report.
 
+    `attributes` are those to write, all by default.
     `radius`, `focus` (distance) and `aperture` (diameter) are in scene units. The same scene,
     camera and seed give the same file.
     """
@@ -68,7 +70,11 @@ def render(
     }
     derive_rest(images, camera, header)
     exr.write(
-        target, channels(images, effects), attributes=header, half=half_channels(), compression="zip"
+        target,
+        channels(images, effects, attributes),
+        attributes=header,
+        half=half_channels(),
+        compression="zip",
     )
     figures: dict[str, Any] = {
         "file": str(target),
@@ -98,11 +104,13 @@ def derive_rest(images: Images, camera: Camera, header: dict[str, Any]) -> None:
             source.arrays[step.target] = images[step.target] = value
 
 
-def channels(images: Images, effects: Sequence[str]) -> dict[str, NDArray[np.float32]]:
-    """Canonical EXR channels of the attributes and references in `images`."""
+def channels(
+    images: Images, effects: Sequence[str], attributes: Sequence[str] | None = None
+) -> dict[str, NDArray[np.float32]]:
+    """Canonical EXR channels of `attributes` (all by default) and references in `images`."""
     found: dict[str, NDArray[np.float32]] = {}
-    for name, attribute in ATTRIBUTES.items():
-        found |= dict(zip(attribute.channels, images[name], strict=True))
+    for name in ATTRIBUTES if attributes is None else attributes:
+        found |= dict(zip(ATTRIBUTES[name].channels, images[name], strict=True))
     for effect in effects:
         outputs = EFFECTS[effect].outputs
         letters = ("V",) if len(outputs) == 1 else outputs

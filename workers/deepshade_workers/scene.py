@@ -76,7 +76,7 @@ class Scene:
         bounds = np.array([box.min, box.max], np.float64).reshape(2, 3)
         if not np.isfinite(bounds).all() or not traced.shapes():
             raise SceneError(f"{path} holds no bounded geometry")
-        points = np.random.default_rng(0).uniform(*bounds, (1024, 3))
+        points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (1024, 3))
         lit = bool(traced.emitters())
         return cls(path.stem, traced, bounds, points, _spread(points), lit)
 

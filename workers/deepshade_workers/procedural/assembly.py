@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..mesh import Floats, Material, Mesh, merge
-from .primitives import Rng, box, cylinder, along, place, sphere
+from .primitives import Rng, along, box, cylinder, place, sphere
 
 
 class Assembly:

@@ -18,12 +18,27 @@ def colonnade(rng: Rng) -> Mesh:
     length = count * gap
     for i in range(int(rng.integers(1, 5))):
         reach = 0.3 * (5 - i)
-        a.span((-length / 2 - reach, i * 0.15, -2 - reach), (length / 2 + reach, i * 0.15 + 0.15,
-                                                             1 + reach))
+        a.span(
+            (-length / 2 - reach, i * 0.15, -2 - reach),
+            (length / 2 + reach, i * 0.15 + 0.15, 1 + reach),
+        )
     base = 0.6
     a.floor(30)
-    profile = np.array([[0, 0], [0.6, 0], [0.6, 0.04], [0.5, 0.07], [0.45, 0.1], [0.42, 0.5],
-                        [0.38, 0.9], [0.5, 0.94], [0.6, 0.96], [0.6, 1], [0, 1]])
+    profile = np.array(
+        [
+            [0, 0],
+            [0.6, 0],
+            [0.6, 0.04],
+            [0.5, 0.07],
+            [0.45, 0.1],
+            [0.42, 0.5],
+            [0.38, 0.9],
+            [0.5, 0.94],
+            [0.6, 0.96],
+            [0.6, 1],
+            [0, 1],
+        ]
+    )
     column = lathe(profile, int(rng.choice([6, 8, 16, 32])))
     rows = int(rng.integers(1, 4))
     for row in range(rows):
@@ -38,14 +53,16 @@ def colonnade(rng: Rng) -> Mesh:
             for k in range(segments):
                 t = np.pi * (k + 0.5) / segments
                 x, y = gap / 2 * np.cos(t), gap / 2 * np.sin(t)
-                turn = np.array([[-np.sin(t), np.cos(t), 0], [np.cos(t), np.sin(t), 0],
-                                 [0, 0, -1.0]])
+                turn = np.array(
+                    [[-np.sin(t), np.cos(t), 0], [np.cos(t), np.sin(t), 0], [0, 0, -1.0]]
+                )
                 a.box((center + x, base + high + y, 0.7), (gap * 0.2, 0.2, thick), turn)
     top = base + high + (gap / 2 + 0.1 if arches else 0)
     for i in range(3):
-        a.span((-length / 2 - 0.4 - i * 0.1, top + i * 0.15, -2), (length / 2 + 0.4 + i * 0.1,
-                                                                   top + i * 0.15 + 0.15,
-                                                                   1 + i * 0.1))
+        a.span(
+            (-length / 2 - 0.4 - i * 0.1, top + i * 0.15, -2),
+            (length / 2 + 0.4 + i * 0.1, top + i * 0.15 + 0.15, 1 + i * 0.1),
+        )
     a.paint()
     a.span((-length / 2 - 1, 0, -2.6), (length / 2 + 1, top, -2.3))
     for i in range(count):
@@ -79,11 +96,15 @@ def town(rng: Rng) -> Mesh:
                     a.box((x + u, y - 0.15, z + d / 2), (w / bays * 0.6, 0.05, proud * 3))
                     a.box((x + u, y, z - d / 2), (w / bays * 0.5, h / floors * 0.5, proud * 2))
             if rng.random() < 0.5:
-                a.add(cylinder(4), place((x, h, z), 1, turn_y(np.pi / 4)) @
-                      place(size=(w * 1.45, 0.01, d * 1.45)))
+                a.add(
+                    cylinder(4),
+                    place((x, h, z), 1, turn_y(np.pi / 4)) @ place(size=(w * 1.45, 0.01, d * 1.45)),
+                )
                 roof = lathe(np.array([[0, 0], [0.75, 0], [0, rng.uniform(0.3, 0.9)]]), 4)
-                a.add(roof, place((x, h, z), (w, 1, d), None) @ place(size=1,
-                                                                      rotation=turn_y(np.pi / 4)))
+                a.add(
+                    roof,
+                    place((x, h, z), (w, 1, d), None) @ place(size=1, rotation=turn_y(np.pi / 4)),
+                )
             else:
                 for _ in range(3):
                     at = (x + rng.uniform(-0.3, 0.3) * w, h + 0.15, z + rng.uniform(-0.3, 0.3) * d)
@@ -151,8 +172,12 @@ def pipes(rng: Rng) -> Mesh:
     for _ in range(int(rng.integers(0, 6))):
         t = np.linspace(0, 1, 40)[:, None]
         knots = rng.uniform([-3, 0.1, -1.8], [3, 3, 1.5], (4, 3))
-        curve = ((1 - t) ** 3 * knots[0] + 3 * t * (1 - t) ** 2 * knots[1]
-                 + 3 * t**2 * (1 - t) * knots[2] + t**3 * knots[3])
+        curve = (
+            (1 - t) ** 3 * knots[0]
+            + 3 * t * (1 - t) ** 2 * knots[1]
+            + 3 * t**2 * (1 - t) * knots[2]
+            + t**3 * knots[3]
+        )
         a.add(tube(curve, rng.uniform(0.02, 0.1)))
     return a.finish()
 
@@ -178,8 +203,13 @@ def machines(rng: Rng) -> Mesh:
                 a.box(center, size, turn)
                 for _ in range(int(rng.integers(0, 4))):
                     small = size * rng.uniform(0.15, 0.6, 3)
-                    offset = np.array([rng.uniform(-0.3, 0.3) * size[0], size[1] / 2,
-                                       rng.uniform(-0.3, 0.3) * size[2]])
+                    offset = np.array(
+                        [
+                            rng.uniform(-0.3, 0.3) * size[0],
+                            size[1] / 2,
+                            rng.uniform(-0.3, 0.3) * size[2],
+                        ]
+                    )
                     a.box(center + turn @ offset, small, turn)
             elif kind < 0.85:
                 size[2] = size[0]

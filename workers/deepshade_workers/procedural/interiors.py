@@ -6,7 +6,7 @@ import numpy as np
 
 from ..mesh import Floats, Mesh
 from .assembly import Assembly
-from .primitives import Rng, cylinder, lathe, place, random_solid, slab, turn_y
+from .primitives import Rng, cylinder, grid_faces, lathe, place, random_solid, slab, turn_y
 
 
 def shell(a: Assembly, width: float, height: float, depth: float, wall: float = 0.2) -> None:
@@ -78,7 +78,7 @@ def chair(a: Assembly, at: Floats, angle: float) -> None:
 
 def shelf(a: Assembly, at: Floats, angle: float, width: float, high: float) -> None:
     """A case of shelves, partly filled with books and odd things."""
-    rng, turn, depth = a.rng, turn_y(angle), rng_depth(a.rng)
+    rng, turn, depth = a.rng, turn_y(angle), a.rng.uniform(0.25, 0.45)
     wall = 0.04
 
     def part(offset: tuple[float, float, float], size: tuple[float, float, float]) -> None:
@@ -103,11 +103,6 @@ def shelf(a: Assembly, at: Floats, angle: float, width: float, high: float) -> N
             x += thick if rng.random() < 0.85 else rng.uniform(0.1, 0.5)
 
 
-def rng_depth(rng: Rng) -> float:
-    """A shelf's depth, in metres."""
-    return float(rng.uniform(0.25, 0.45))
-
-
 def sofa(a: Assembly, at: Floats, angle: float, width: float) -> None:
     """A sofa: a seat with cushions, a back and two arms."""
     rng, turn = a.rng, turn_y(angle)
@@ -122,10 +117,16 @@ def sofa(a: Assembly, at: Floats, angle: float, width: float) -> None:
     seats = int(rng.integers(2, 4))
     for i in range(seats):
         x = width * ((i + 0.5) / seats - 0.5)
-        a.add(random_cushion(), place(at + turn @ np.array([x, 0.47, 0.05]), 1, turn) @
-              place(size=(width / seats * 0.97, 0.18, 0.7)))
-        a.add(random_cushion(), place(at + turn @ np.array([x, 0.72, -0.2]), 1, turn) @
-              place(size=(width / seats * 0.9, 0.45, 0.18)))
+        a.add(
+            random_cushion(),
+            place(at + turn @ np.array([x, 0.47, 0.05]), 1, turn)
+            @ place(size=(width / seats * 0.97, 0.18, 0.7)),
+        )
+        a.add(
+            random_cushion(),
+            place(at + turn @ np.array([x, 0.72, -0.2]), 1, turn)
+            @ place(size=(width / seats * 0.9, 0.45, 0.18)),
+        )
 
 
 def random_cushion() -> Mesh:
@@ -140,8 +141,6 @@ def random_cushion() -> Mesh:
     x = 0.5 * cu * power(np.sin(v))
     z = 0.5 * cu * power(np.cos(v))
     y = np.broadcast_to(0.5 * su, x.shape)
-    from .primitives import grid_faces
-
     vertices = np.stack([x, y, z], -1).reshape(-1, 3)
     return Mesh.build(vertices, grid_faces(13, 24, wrap=True), crease=60)
 
@@ -258,7 +257,7 @@ def stairs(rng: Rng) -> Mesh:
             turn = turn_y(i * sweep)
             center = turn @ np.array([inner + wide / 2, (i + 0.5) * rise, 0])
             a.box(center, (wide, rise * rng.uniform(0.3, 0.9), run * 2), turn)
-            a.bar(center + [0, 0, 0], center + np.array([0, 0.9, 0]), 0.04)
+            a.bar(center, center + np.array([0, 0.9, 0]), 0.04)
     else:
         solid = rng.random() < 0.6
         for i in range(steps):

@@ -10,6 +10,7 @@ from .interiors import clutter, curtain, vase
 from .primitives import (
     Rng,
     blob,
+    cone,
     noise,
     place,
     random_rotation,
@@ -66,7 +67,10 @@ def foliage(rng: Rng) -> Mesh:
     """Bushes, grass and pots: thin leaves over uneven ground."""
     a = Assembly(rng)
     wave = noise(rng, 3, 0.08)
-    height = lambda x, z: 0.3 * wave(np.stack([x, 0 * x, z], -1).reshape(-1, 3)).reshape(x.shape)  # noqa: E731
+
+    def height(x: Floats, z: Floats) -> Floats:
+        return 0.3 * wave(np.stack([x, 0 * x, z], -1).reshape(-1, 3)).reshape(x.shape)
+
     a.add(sheet(height, 48, 14))
     for _ in range(int(rng.integers(3, 9))):
         a.paint()
@@ -132,8 +136,6 @@ def terrain(rng: Rng) -> Mesh:
             size = rng.uniform(0.15, 0.9, 3)
             a.add(rock(rng), place((x, ground, z), size, random_rotation(rng)))
         else:
-            from .primitives import cone
-
             high = rng.uniform(0.6, 1.8)
             a.bar(np.array([x, ground, z]), np.array([x, ground + 0.5 * high, z]), 0.1 * high)
             for k in range(3):
@@ -145,12 +147,11 @@ def terrain(rng: Rng) -> Mesh:
 
 def cave(rng: Rng) -> Mesh:
     """The inside of a rough hollow, with boulders and stalagmites."""
-    from .primitives import cone
-
     a = Assembly(rng)
     hollow = blob(rng, rng.uniform(0.3, 0.7), detail=5, creased=rng.random() < 0.4)
-    inside = Mesh(hollow.vertices, hollow.faces[:, ::-1], -hollow.normals[:, ::-1],
-                  hollow.materials)
+    inside = Mesh(
+        hollow.vertices, hollow.faces[:, ::-1], -hollow.normals[:, ::-1], hollow.materials
+    )
     a.add(inside, place(size=(9, 6, 9)))
     for _ in range(int(rng.integers(20, 60))):
         a.paint()
@@ -162,7 +163,7 @@ def cave(rng: Rng) -> Mesh:
         if rng.random() < 0.4:
             size[1] *= 2
             flip = np.eye(3) if at[1] < 0 else np.diag([1.0, -1, -1])
-            a.add(cone(10), place(at, size * [0.4, 1, 0.4], flip))
+            a.add(cone(10), place(at, size * np.array([0.4, 1, 0.4]), flip))
         else:
             a.add(rock(rng), place(at, size, random_rotation(rng)))
     return a.finish()
@@ -225,7 +226,7 @@ def _figure(a: Assembly, at: Floats, turn: Floats, size: float) -> None:
     lump(np.array([0, leg + thick / 2, 0]), np.array([thick, thick, long]))
     head = np.array([0, leg + thick * rng.uniform(0.8, 1.5), long * 0.55])
     lump(head, np.full(3, thick * rng.uniform(0.5, 0.9)))
-    lump(head + [0, -0.05, thick * 0.35], np.array([0.25, 0.2, 0.35]) * thick * 1.3)
+    lump(head + np.array([0, -0.05, thick * 0.35]), np.array([0.25, 0.2, 0.35]) * thick * 1.3)
     lump((head + np.array([0, leg + thick / 2, long * 0.3])) / 2, np.full(3, thick * 0.6))
     for sx in (-1, 1):
         ear = head + np.array([sx * thick * 0.25, thick * 0.35, -0.05])
@@ -233,10 +234,12 @@ def _figure(a: Assembly, at: Floats, turn: Floats, size: float) -> None:
         for sz in (-1, 1):
             foot = np.array([sx * thick * 0.3, leg * 0.5, sz * long * 0.33])
             lump(foot, np.array([0.28 * thick, leg * 1.3, 0.28 * thick]))
-            lump(foot - [0, leg * 0.45, -0.05], np.array([0.3, 0.15, 0.42]) * thick)
+            lump(foot - np.array([0, leg * 0.45, -0.05]), np.array([0.3, 0.15, 0.42]) * thick)
     t = np.linspace(0, 1, 24)[:, None]
     curl = rng.uniform(-1, 1, 3) * 0.6
-    tail = np.array([0, leg + thick * 0.6, -long * 0.45]) + t * [0, 0.2, -0.5] + t**2 * curl
+    tail = (
+        np.array([0, leg + thick * 0.6, -long * 0.45]) + t * np.array([0, 0.2, -0.5]) + t**2 * curl
+    )
     path = at + (tail * size) @ turn.T
     a.add(tube(path, 0.06 * size * rng.uniform(0.5, 1.3)))
 

@@ -1,0 +1,105 @@
+"""`deepshade doctor`, libLLVM's search, and what the machine allows."""
+
+import json
+import socket
+
+import pytest
+
+from deepshade import doctor, machine
+from deepshade.cli import main
+from deepshade.llvm import find_libllvm, libllvm_version
+
+
+def library(folder, name):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(b"")
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-19.so", 19),
+        ("libLLVM.so.19.1", 19),
+        ("libLLVM-17.so.1", 17),
+        ("libLLVM-14.0.6.so.1", 14),
+        ("libLLVM.dylib", None),
+        ("libc.so.6", None),
+    ],
+)
+def test_libllvm_versions(tmp_path, name, version):
+    assert libllvm_version(library(tmp_path / "lib", name)) == version
+
+
+def test_finds_the_best_libllvm(tmp_path):
+    folders = (str(tmp_path / "a"), str(tmp_path / "llvm-*/lib"))
+    assert find_libllvm({}, folders) is None
+    library(tmp_path / "a", "libLLVM-14.so.1")
+    library(tmp_path / "a", "libLLVM-16.so.1")
+    assert find_libllvm({}, folders) is None  # refused, and crashing
+    newer = library(tmp_path / "llvm-21/lib", "libLLVM.so.21.1")
+    assert find_libllvm({}, folders) == newer
+    known = library(tmp_path / "a", "libLLVM.so.19.1")
+    assert find_libllvm({}, folders) == known
+
+
+def test_the_environment_wins(tmp_path):
+    own = library(tmp_path, "mine.so")
+    assert find_libllvm({"DRJIT_LIBLLVM_PATH": str(own)}, ()) == own
+    assert find_libllvm({"DRJIT_LIBLLVM_PATH": str(tmp_path / "none.so")}, ()) is None
+
+
+def test_cgroup_quota(tmp_path):
+    assert machine.cpu_quota(tmp_path) is None
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    assert machine.cpu_quota(tmp_path) is None
+    (tmp_path / "cpu.max").write_text("150000 100000\n")
+    assert machine.cpu_quota(tmp_path) == 1.5
+    (tmp_path / "memory.max").write_text("1048576\n")
+    assert machine.memory_bytes(tmp_path) == 1 << 20
+    (tmp_path / "memory.max").write_text("max\n")
+    assert machine.memory_bytes(tmp_path) > 1 << 20
+    assert machine.cpu_count() >= 1
+
+
+def test_a_taken_port_is_a_warning():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        (check,) = doctor.check_port(taken.getsockname()[1])
+    assert not check.ok
+    assert not check.required
+    assert check.fix
+
+
+def test_a_broken_bundle_is_an_error(tmp_path):
+    (check,) = doctor.check_bundles(tmp_path)
+    assert not check.required
+    folder = tmp_path / "ao" / "default"
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text("{}")
+    (check,) = doctor.check_bundles(tmp_path)
+    assert check.required
+    assert not check.ok
+
+
+def test_every_failure_has_a_fix_of_one_line(monkeypatch):
+    monkeypatch.setattr(doctor, "installed", lambda module: module == "mitsuba")
+    monkeypatch.setattr(doctor, "missing_packages", lambda extra: ["thing"])
+    monkeypatch.setattr(doctor, "find_libllvm", lambda: None)
+    failed = [c for c in doctor.run_checks() if not c.ok]
+    assert {"core packages", "libLLVM", "extra 'service'"} <= {c.name for c in failed}
+    for check in failed:
+        assert check.fix
+        assert "\n" not in check.fix
+
+
+def test_exit_codes(monkeypatch, capsys):
+    bad = doctor.Check("thing", False, True, "gone", "fetch it")
+    monkeypatch.setattr(doctor, "_CHECKS", (lambda: [bad],))
+    assert main(["doctor"]) == 1
+    assert "fix: fetch it" in capsys.readouterr().out
+    warning = doctor.Check("thing", False, False, "gone", "fetch it")
+    monkeypatch.setattr(doctor, "_CHECKS", (lambda: [warning],))
+    assert main(["doctor", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["name"] == "thing"

@@ -1,0 +1,116 @@
+"""The tables of effects and attributes, and the machine-readable facts about extras."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from deepshade.attributes import ATTRIBUTES
+from deepshade.effects import EFFECTS
+from deepshade.errors import ConfigError, LimitError, MissingAttributeError, nearest
+from deepshade.extras import EXTRAS, extra_of
+from deepshade.profiles import PROFILES, QUANTITIES, detect, match_rank
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# the design's table of attributes, written out a second time
+CANONICAL = {
+    "position": "position.X position.Y position.Z",
+    "normal": "normal.X normal.Y normal.Z",
+    "normal_world": "normal_world.X normal_world.Y normal_world.Z",
+    "depth": "Z",
+    "focal": "focal.V",
+    "view": "view.X view.Y view.Z",
+    "view_angle": "view_angle.V",
+    "diffuse": "diffuse.R diffuse.G diffuse.B",
+    "specular": "specular.R specular.G specular.B",
+    "gloss": "gloss.V",
+    "scatter": "scatter.R scatter.G scatter.B",
+    "light": "light.R light.G light.B",
+    "light_diffuse": "light_diffuse.R light_diffuse.G light_diffuse.B",
+    "motion": "motion.U motion.V",
+}
+
+
+def test_attributes_are_the_designs():
+    assert {name: " ".join(a.channels) for name, a in ATTRIBUTES.items()} == CANONICAL
+
+
+def test_effects_use_known_attributes_and_outputs():
+    assert list(EFFECTS) == ["ao", "do", "ibl", "gi", "sss", "dof", "mb", "aa", "full"]
+    for effect in EFFECTS.values():
+        assert set(effect.inputs) <= set(ATTRIBUTES)
+        assert effect.outputs in (("Y",), ("R", "G", "B"))
+    assert EFFECTS["ao"].inputs == ("normal", "position")
+    assert EFFECTS["ao"].background == 1.0
+    assert EFFECTS["ao"].input_channels[3] == "position.X"
+    assert [e.name for e in EFFECTS.values() if e.per_channel] == ["gi", "sss", "dof", "mb", "aa"]
+
+
+def test_extras_agree_with_the_project_file():
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for extra, packages in EXTRAS.items():
+        wanted = {
+            re.split(r"[\[><=!~ ]", requirement)[0]
+            for requirement in declared["optional-dependencies"][extra]
+        }
+        assert {package for _, package in packages} == wanted
+    assert extra_of("torch.nn") == "trainer"
+    assert extra_of("numpy") is None
+
+
+def test_profiles_name_known_quantities_and_sign_every_component():
+    for profile in PROFILES.values():
+        for source in profile.sources:
+            assert source.quantity in QUANTITIES
+            assert len(source.signs) in (0, QUANTITIES[source.quantity])
+
+
+@pytest.mark.parametrize(
+    ("header", "name"),
+    [
+        ({"generatedBy": "Mitsuba version 3.9.1"}, "mitsuba"),
+        ({"arnold/version": "7"}, "arnold"),
+        ({"cycles.View Layer.samples": "128"}, "blender"),
+        ({"File": "D:\\helmet.blend"}, "blender"),
+        ({"unreal/camera/curPos/x": "1"}, "unreal"),
+        ({"deepshade:fov": 50.0}, None),
+    ],
+)
+def test_detects_the_renderer(header, name):
+    found = detect(header)
+    assert (found.name if found else None) == name
+
+
+@pytest.mark.parametrize(
+    ("layer", "alias", "stem", "rank"),
+    [
+        ("normal", "normal", False, 0),
+        ("ViewLayer.Normal", "Normal", False, 1),
+        ("ViewLayer.Normal", "normal", False, 3),
+        ("NORMAL", "normal", False, 2),
+        ("FinalImageMovieRenderQueue_WorldDepth", "WorldDepth", False, 1),
+        ("subnormal", "normal", False, None),
+        ("crypto_N", "N", False, None),
+        ("shot_N", "N", True, 1),
+        ("shot_normal_0012", "normal", True, 1),
+        ("shot_normal_world.0001", "normal_world", True, 1),
+        ("shot_normal_world", "normal", True, None),
+    ],
+)
+def test_match_rank(layer, alias, stem, rank):
+    assert match_rank(layer, alias, from_stem=stem) == rank
+
+
+def test_errors_say_what_and_what_to_do():
+    limit = LimitError("pixels", 10_000, 100)
+    assert "10,000 pixels" in str(limit)
+    assert "'pixels'" in limit.fix
+    missing = MissingAttributeError(["normal"], ["Nornal.X"], {"normal": ("Nornal",)})
+    assert "'normal'" in str(missing)
+    assert "Nornal.X" in str(missing)
+    assert "--map normal=Nornal" in missing.fix
+    config = ConfigError("raduis", ["radius", "fov"])
+    assert "radius" in config.fix
+    assert nearest("zzz", ["radius"]) is None

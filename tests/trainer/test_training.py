@@ -1,0 +1,127 @@
+"""The training loop: learns, resumes exactly, and ignores poison."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from deepshade.errors import ConfigError, DataError
+from deepshade_trainer.recipe import PRESETS, Recipe, preset
+from deepshade_trainer.run import Run
+from deepshade_trainer.training import train
+
+from .conftest import write_data
+
+
+def weights(run: Run) -> dict[str, torch.Tensor]:
+    groups, _, _ = run.load()
+    return groups["average"]
+
+
+@pytest.mark.slow
+def test_it_learns(data: Path, tmp_path: Path, recipe: Recipe) -> None:
+    recipe = recipe.changed(steps=120, rate=4e-3)
+    steps = list(train(recipe, [data], Run(tmp_path / "run")))
+    assert [p.step for p in steps] == list(range(1, 121))
+    assert steps[-1].loss < 0.6 * steps[0].loss
+    figures = steps[-1].figures
+    assert figures is not None
+    assert figures["dssim"] < 0.7 * figures["trivial_dssim"]
+    history = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert history[-1]["step"] == 120
+    assert list((tmp_path / "run/log").glob("events*"))
+
+
+def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
+    data: Path, tmp_path: Path, recipe: Recipe
+) -> None:
+    whole, parts = Run(tmp_path / "whole"), Run(tmp_path / "parts")
+    list(train(recipe, [data], whole))
+    for progress in train(recipe, [data], parts):
+        if progress.step == 3:
+            os.kill(os.getpid(), signal.SIGTERM)  # as a scheduler would
+    assert parts.load()[1] == 4
+    list(train(recipe, [data], parts))
+    expected, found = weights(whole), weights(parts)
+    for name, tensor in expected.items():
+        assert torch.equal(tensor, found[name]), name
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    settings = ["steps=100000", "batch=4", "network.widths=[8,12]", "precision=fp32"]
+    command = [sys.executable, "-m", "deepshade.cli", "train", "ao", "--data", str(data)]
+    command += ["--out", str(out), *(x for s in settings for x in ("--set", s))]
+    for _ in range(2):
+        before = Run(out).load()[1] if Run(out).checkpoint.exists() else 0
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        limit = time.monotonic() + 120
+        while time.monotonic() < limit:
+            if Run(out).checkpoint.exists() and Run(out).load()[1] > before:
+                break
+            assert process.poll() is None
+            time.sleep(0.2)
+        process.kill()
+        process.wait()
+        assert Run(out).load()[1] > before
+
+
+def test_poisoned_batches_teach_nothing_and_are_named(tmp_path: Path, recipe: Recipe) -> None:
+    data = write_data(tmp_path / "data", broken=(2, 9))
+    recipe = recipe.changed(steps=12, held_out=0.0)
+    warnings = [p.warning for p in train(recipe, [data], Run(tmp_path / "run")) if p.warning]
+    assert warnings
+    assert all("non-finite samples" in w and "shard-0000" in w for w in warnings)
+    assert any("wave:1" in w or "wave:4" in w for w in warnings)
+    for tensor in weights(Run(tmp_path / "run")).values():
+        assert torch.isfinite(tensor).all()
+
+
+def test_another_recipe_does_not_resume(data: Path, tmp_path: Path, recipe: Recipe) -> None:
+    list(train(recipe, [data], Run(tmp_path)))
+    with pytest.raises(ConfigError, match="another recipe"):
+        list(train(recipe.changed(rate=0.1), [data], Run(tmp_path)))
+    # More steps are the same run, longer.
+    longer = list(train(recipe.changed(steps=8), [data], Run(tmp_path)))
+    assert [p.step for p in longer] == [7, 8]
+
+
+def test_a_damaged_checkpoint_is_said(data: Path, tmp_path: Path, recipe: Recipe) -> None:
+    list(train(recipe, [data], Run(tmp_path)))
+    content = Run(tmp_path).checkpoint.read_bytes()
+    Run(tmp_path).checkpoint.write_bytes(content[: len(content) // 2])
+    with pytest.raises(DataError, match="can't be read"):
+        list(train(recipe.changed(steps=9), [data], Run(tmp_path)))
+
+
+def test_too_little_data(data: Path, tmp_path: Path, recipe: Recipe) -> None:
+    with pytest.raises(DataError, match="don't fill a batch"):
+        list(train(recipe.changed(batch=200), [data], Run(tmp_path)))
+
+
+def test_presets_and_settings() -> None:
+    for name in PRESETS:
+        assert preset(name, "ao").effect == "ao"
+    paper = preset("paper", "ao")
+    assert (paper.optimizer, paper.batch, paper.network.kind) == ("adadelta", 16, "paper")
+    with pytest.raises(ConfigError) as caught:
+        paper.changed(stpes=3)
+    assert caught.value.nearest == "steps"
+    with pytest.raises(ConfigError):
+        paper.changed(network={"width": 3})
+    with pytest.raises(ConfigError):
+        preset("papr", "ao")
+
+
+def test_a_recipe_survives_saving(tmp_path: Path, recipe: Recipe) -> None:
+    recipe.write(tmp_path / "recipe.json")
+    assert Recipe.read(tmp_path / "recipe.json") == recipe

@@ -1,0 +1,179 @@
+"""`deepshade train`, `deepshade evaluate` and `deepshade export`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+Effect = Annotated[str, typer.Argument(help="Effect to train, such as 'ao'.")]
+Data = Annotated[list[Path], typer.Option(help="Data folder of 'deepshade datagen'; repeatable.")]
+
+
+def train(
+    effect: Effect,
+    data: Data,
+    out: Annotated[Path, typer.Option(help="Run folder; an existing run goes on.")],
+    preset: Annotated[str, typer.Option(help="default, paper or paper-network.")] = "default",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Change one setting: --set steps=4000; repeatable."),
+    ] = None,
+    device: Annotated[str, typer.Option(help="'cpu' or 'cuda'.")] = "cpu",
+    threads: Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)] = 0,
+) -> None:
+    """Train a shader. Ctrl-C saves and stops; the same command goes on. Examples:
+
+    deepshade train ao --data data/ao --out runs/ao
+
+    deepshade train ao --data data/ao --out runs/paper --preset paper --set steps=6000
+    """
+    import torch
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from .recipe import preset as load_preset
+    from .run import Run
+    from .training import train as steps
+
+    if threads:
+        torch.set_num_threads(threads)
+    recipe = load_preset(preset, effect).changed(**_parse(settings or []))
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[loss]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=recipe.steps, loss="")
+        for progress in steps(recipe, data, Run(out), device=device):
+            bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.4f}")
+            if progress.warning:
+                console.print(progress.warning, style="yellow")
+            if progress.figures:
+                console.print(
+                    f"step {progress.step}: loss {progress.loss:.4f}  held-out DSSIM "
+                    f"{progress.figures['dssim']:.4f} ({progress.figures['ratio']:.3f} x all "
+                    f"white)  MAE {progress.figures['mae']:.4f}"
+                )
+    typer.echo(f"the run is in {out}")
+
+
+def evaluate(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, such as models/ao/balanced.")],
+    data: Data,
+    sheet: Annotated[Path | None, typer.Option(help="PNG contact sheet to write.")] = None,
+    min_contrast: Annotated[
+        float, typer.Option(help="Leave out views whose reference varies less.")
+    ] = 0.12,
+    limit: Annotated[int | None, typer.Option(help="Views at most.", min=1)] = None,
+    half: Annotated[str, typer.Option(help="Attributes rounded to 16 bits, commas between.")] = "",
+    scale: Annotated[float, typer.Option(help="Scale scene and radius by this.")] = 1.0,
+    stretch: Annotated[
+        float, typer.Option(help="Shorten normals at random by up to this share.", min=0, max=0.99)
+    ] = 0.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+) -> None:
+    """Measure a bundle against references: SSIM, PSNR, MAE, FLIP of each view and the mean.
+
+    Every figure stands beside that of the trivial answer (all white for ao) on the same views.
+
+      deepshade evaluate models/ao/balanced --data data/test --sheet out/sheet.png
+    """
+    from rich.console import Console
+    from rich.progress import track
+    from rich.table import Table
+
+    from deepshade import pictures
+    from deepshade.bundles import Bundle
+
+    from .evaluation import Variant, contact_sheet, document, summary
+    from .evaluation import evaluate as measure
+
+    found = Bundle.load(bundle)
+    variant = Variant(tuple(name for name in half.split(",") if name), scale, stretch)
+    noise = Console(stderr=True)
+    rows = list(
+        track(
+            measure(found, data, min_contrast=min_contrast, limit=limit, variant=variant),
+            "shading",
+            console=noise,
+            disable=not noise.is_terminal,
+        )
+    )
+    if sheet is not None:
+        pictures.save(sheet, contact_sheet(rows[:24]))
+    if as_json:
+        typer.echo(json.dumps(document(found, rows, variant)))
+        return
+    shown = ("ssim", "psnr", "mae", "flip", "dssim", "trivial_dssim")
+    listing = Table("scene", *shown)
+    for row in rows:
+        listing.add_row(row.scene, *(f"{row.figures[name]:.4f}" for name in shown))
+    mean = summary(rows)
+    listing.add_section()
+    listing.add_row(f"mean of {len(rows)}", *(f"{mean[name]:.4f}" for name in shown))
+    Console().print(listing)
+    typer.echo(f"DSSIM is {mean['ratio']:.3f} x the trivial answer's")
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="Run folder of 'deepshade train'.")],
+    out: Annotated[Path, typer.Option(help="Bundle folder, such as models/ao/balanced.")],
+    data: Annotated[
+        list[Path], typer.Option(help="Data whose G-buffers prove parity; repeatable.")
+    ],
+    test: Annotated[
+        list[Path] | None, typer.Option(help="Test data for the model card; repeatable.")
+    ] = None,
+    radius: Annotated[
+        float, typer.Option(help="Effect radius of requests that name none, scene units.")
+    ] = 1.0,
+    note: Annotated[Path | None, typer.Option(help="Text that ends the model card.")] = None,
+) -> None:
+    """Write a bundle, prove that ONNX Runtime equals torch, and measure it for its card.
+
+    deepshade export runs/ao --out models/ao/balanced --data data/ao --test data/test
+    """
+    from .card import measure, write_card
+    from .export import export as write
+    from .run import Run
+
+    bundle, worst = write(Run(run), out, data, radius=radius)
+    if test:
+        bundle = measure(bundle, test)
+    write_card(bundle, Run(run), note.read_text() if note else "")
+    typer.echo(f"{out}: sha256 {bundle.sha256}, ONNX Runtime within {worst:.1e} of torch")
+
+
+def _parse(settings: list[str]) -> dict[str, Any]:
+    """`key=value` settings; values are JSON where they parse, `network.key` goes inside."""
+    from deepshade.errors import ConfigError
+
+    parsed: dict[str, Any] = {}
+    for setting in settings:
+        key, separator, text = setting.partition("=")
+        if not separator:
+            raise ConfigError(setting, detail=f"--set needs key=value, not {setting!r}")
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text
+        if key.startswith("network."):
+            parsed.setdefault("network", {})[key.removeprefix("network.")] = value
+        else:
+            parsed[key] = value
+    return parsed

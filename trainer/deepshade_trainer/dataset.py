@@ -1,0 +1,192 @@
+"""Reads shards by memory mapping, and makes batches of G-buffers and references."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from queue import Queue
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import safe_open
+from torch import Tensor
+
+from deepshade import symmetry
+from deepshade.effects import EFFECTS
+from deepshade.errors import DataError
+from deepshade.manifest import Manifest, shard_path
+
+Sample = dict[str, NDArray[np.float32]]
+
+# Shares of batches that see 16-bit positions, as renderers store them.
+HALF_POSITIONS = 0.3
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where a sample lies, and what it was rendered from."""
+
+    path: Path
+    index: int
+    record: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """For messages: shard, index and scene."""
+        return f"{self.path.name}[{self.index}] ({self.record['scene']})"
+
+
+class Dataset:
+    """All samples of one effect in one or several data folders.
+
+    Raises:
+        DataError: a folder holds no manifest, lacks a shard, or was made for other effects.
+    """
+
+    def __init__(self, folders: Sequence[Path], effect: str) -> None:
+        self.effect = EFFECTS[effect]
+        self.reference = f"reference_{effect}"
+        self.entries: list[Entry] = []
+        self._open: dict[Path, Any] = {}
+        for folder in folders:
+            manifest = Manifest.read(folder)
+            missing = {*self.effect.inputs, self.reference} - set(manifest.schema)
+            if missing:
+                raise DataError(
+                    f"{folder} has no {', '.join(sorted(missing))}",
+                    fix=f"render it with --effects {effect}",
+                )
+            for shard in manifest.shards:
+                path = shard_path(folder, shard)
+                if not path.is_file():
+                    raise DataError(f"{path} is named by the manifest but missing")
+                self.entries += [Entry(path, k, r) for k, r in enumerate(shard.samples)]
+
+    def split(self, share: float, *, seed: int = 0) -> tuple[list[int], list[int]]:
+        """Sample numbers to train on and to validate on; no scene is in both."""
+        held = [_unit(f"{seed}:{entry.record['scene']}") < share for entry in self.entries]
+        training = [k for k, out in enumerate(held) if not out]
+        return training, [k for k, out in enumerate(held) if out]
+
+    def load(self, number: int) -> Sample:
+        """Sample `number`: planar float32 inputs in physical units, and its reference."""
+        entry = self.entries[number]
+        if entry.path not in self._open:
+            try:
+                self._open[entry.path] = safe_open(entry.path, framework="numpy")
+            except Exception as error:  # safetensors' own error type says only "invalid header"
+                raise DataError(f"{entry.path} can't be read: {error}") from error
+        file = self._open[entry.path]
+        names = (*self.effect.inputs, self.reference)
+        return {
+            name: file.get_slice(name)[entry.index].astype(np.float32, copy=False) for name in names
+        }
+
+    def gbuffer(self, sample: Sample, radius: float) -> NDArray[np.float32]:
+        """The network's input (C, H, W): positions in units of the effect radius."""
+        planes = [
+            sample[name] / np.float32(radius) if name == "position" else sample[name]
+            for name in self.effect.inputs
+        ]
+        return np.concatenate(planes)
+
+    def batch(
+        self, numbers: Sequence[int], rng: np.random.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """G-buffers (N, C, H, W) and references (N, outputs, H, W).
+
+        With `rng`, each sample is turned by a random symmetry and some have 16-bit positions.
+        """
+        inputs, references = [], []
+        for number in numbers:
+            sample = self.load(number)
+            turn = int(rng.integers(symmetry.COUNT)) if rng is not None else 0
+            half = rng is not None and bool(rng.random() < HALF_POSITIONS)
+            turned = {
+                name: symmetry.apply(plane, None if name == self.reference else name, turn)
+                for name, plane in sample.items()
+            }
+            if half and "position" in turned:
+                turned["position"] = turned["position"].astype(np.float16).astype(np.float32)
+            inputs.append(self.gbuffer(turned, float(self.entries[number].record["radius"])))
+            references.append(turned[self.reference])
+        return torch.from_numpy(np.stack(inputs)), torch.from_numpy(np.stack(references))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One training step's data."""
+
+    step: int
+    numbers: list[int]
+    gbuffer: Tensor
+    reference: Tensor
+
+
+def batches(
+    data: Dataset, numbers: Sequence[int], size: int, *, seed: int, first: int, last: int
+) -> Iterator[Batch]:
+    """Batches of steps `first` to `last` - 1, read ahead in a thread.
+
+    The samples of a step depend on `seed` and the step alone, so that a resumed run sees what an
+    uninterrupted one would have seen. Every sample comes once before any comes again.
+    """
+    queue: Queue[Batch | BaseException] = Queue(maxsize=4)
+    stop = Event()
+
+    def read() -> None:
+        try:
+            for step in range(first, last):
+                if stop.is_set():
+                    return
+                chosen = _chosen(numbers, size, seed, step)
+                rng = np.random.default_rng([seed, step, 1])
+                queue.put(Batch(step, chosen, *data.batch(chosen, rng)))
+        except BaseException as error:  # handed to the training loop
+            queue.put(error)
+
+    thread = Thread(target=read, daemon=True)
+    thread.start()
+    try:
+        for _ in range(first, last):
+            item = queue.get()
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        stop.set()
+        while thread.is_alive():
+            while not queue.empty():
+                queue.get_nowait()
+            thread.join(0.05)
+
+
+def _chosen(numbers: Sequence[int], size: int, seed: int, step: int) -> list[int]:
+    chosen = []
+    for position in range(step * size, (step + 1) * size):
+        epoch, place = divmod(position, len(numbers))
+        order = _permutation(len(numbers), seed, epoch)
+        chosen.append(numbers[order[place]])
+    return chosen
+
+
+_orders: dict[tuple[int, int, int], NDArray[np.int64]] = {}
+
+
+def _permutation(count: int, seed: int, epoch: int) -> NDArray[np.int64]:
+    key = (count, seed, epoch)
+    if key not in _orders:
+        if len(_orders) > 4:
+            _orders.clear()
+        _orders[key] = np.random.default_rng([seed, epoch]).permutation(count)
+    return _orders[key]
+
+
+def _unit(text: str) -> float:
+    """A hash of `text` in [0, 1)."""
+    return int.from_bytes(sha256(text.encode()).digest()[:8], "little") / 2.0**64
