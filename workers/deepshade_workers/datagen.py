@@ -19,7 +19,7 @@ from .loading import PROCEDURAL, SUFFIXES, parse_procedural
 from .procedural import FAMILIES
 from .shards import Images, schema, shard_name, write_shard
 
-# How often a sample whose scene shows nothing may ask for another scene.
+# How often a sample whose scene shows nothing useful may ask for another scene.
 SCENE_TRIES = 16
 
 
@@ -124,8 +124,10 @@ def make_sample(job: Job, index: int) -> tuple[Images, dict[str, Any]]:
             )
             break
         except SceneError:
-            if not fresh or attempt == SCENE_TRIES - 1:
+            if attempt == SCENE_TRIES - 1:
                 raise
+            # One bare scene shall not end a long job: another takes its place.
+            choice = job.scenes[int(rng.integers(len(job.scenes)))]
     noise = int(rng.integers(2**63))
     images, _ = render_sample(
         scene,

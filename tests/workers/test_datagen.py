@@ -1,0 +1,250 @@
+"""Data sets: the same bytes for the same seeds, whatever is killed on the way."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from deepshade.camera import Camera
+from deepshade.errors import ConfigError, DataError, SceneError
+from deepshade.manifest import Manifest, sha256
+from deepshade_workers.datagen import Job, expand_scenes, generate, make_sample, make_shard
+from deepshade_workers.loading import open_scene
+from deepshade_workers.procedural import FAMILIES
+from deepshade_workers.sample import render_sample
+
+SCENES = ("procedural:stairs", "procedural:level", "procedural:rubble")
+JOB = Job(scenes=SCENES, views=12, size=32, frame=64, spp=16, seed=5, shard_size=3)
+ROOT = Path(__file__).parents[2]
+DEEPSHADE = Path(sys.executable).with_name("deepshade")
+
+
+def command(out: Path, job: Job = JOB) -> list[str]:
+    """The command line of `job`."""
+    options = ["--out", str(out), *(x for s in job.scenes for x in ("--scenes", s))]
+    for key in ("views", "size", "frame", "spp", "seed", "shard_size"):
+        options += [f"--{key.replace('_', '-')}", str(getattr(job, key))]
+    return [*options, "--json"]
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: Any) -> dict[str, str]:
+    """Digests of the shards, made in this process without Ray."""
+    folder = tmp_path_factory.mktemp("expected")
+    shards = [make_shard(JOB, k, folder, lambda: None) for k in range(JOB.shards)]
+    return {shard.file: shard.sha256 for shard in shards}
+
+
+def check(folder: Path, expected: dict[str, str]) -> None:
+    """`folder` holds the whole set, once, and nothing else."""
+    manifest = Manifest.read(folder)
+    assert manifest.count == JOB.views
+    assert {shard.file: shard.sha256 for shard in manifest.shards} == expected
+    for name, digest in expected.items():
+        assert sha256(folder / name) == digest
+    assert {p.name for p in folder.iterdir()} == {*expected, "manifest.json"}
+
+
+def test_a_sample_can_be_rendered_again_from_its_record() -> None:
+    images, record = make_sample(JOB, 4)
+    again, same = make_sample(JOB, 4)
+    assert record == same
+    assert json.loads(json.dumps(record)) == record
+    camera = record["camera"]
+    view = Camera(
+        camera["fov"],
+        *camera["frame"],
+        np.array(camera["world_to_camera"]),
+        *camera["origin"],
+    )
+    rendered, _ = render_sample(
+        open_scene(record["scene"]),
+        view,
+        JOB.size,
+        JOB.size,
+        effects=["ao"],
+        radius=record["radius"],
+        samples=JOB.spp,
+        seed=record["seed"],
+    )
+    for name, image in images.items():
+        assert (image == again[name]).all()
+        assert (image == rendered[name]).all()
+
+
+def test_a_shard_holds_what_the_manifest_says(tmp_path: Path) -> None:
+    shard = make_shard(JOB, 1, tmp_path, lambda: None)
+    tensors = load_file(tmp_path / shard.file)
+    assert tensors["position"].dtype == np.float32
+    assert tensors["normal"].dtype == np.float16
+    assert tensors["reference_ao"].shape == (3, 1, 32, 32)
+    assert len(shard.samples) == 3
+    assert [record["scene"].split(":")[1] for record in shard.samples] == [
+        SCENES[k % 3].split(":")[1] for k in JOB.samples(1)
+    ]
+
+
+def test_scene_names_expand(tmp_path: Path) -> None:
+    assert len(expand_scenes(["procedural"])) == len(FAMILIES)
+    assert expand_scenes(["procedural:room:7"]) == ("procedural:room:7",)
+    for name in ("b.obj", "a.glb", "notes.txt"):
+        (tmp_path / name).touch()
+    assert expand_scenes([str(tmp_path)]) == (str(tmp_path / "a.glb"), str(tmp_path / "b.obj"))
+    for wrong in ("nothing.obj", "procedural:rom", str(tmp_path / "notes.txt")):
+        with pytest.raises(SceneError):
+            expand_scenes([wrong])
+
+
+@pytest.mark.parametrize(
+    "change", [{"views": 0}, {"seed": -1}, {"frame": 8}, {"scenes": ()}, {"shard_size": 0}]
+)
+def test_impossible_jobs_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        Job(**{"scenes": SCENES, "views": 1, **change})
+
+
+def test_another_job_does_not_go_on(tmp_path: Path) -> None:
+    Manifest(JOB.settings(), {}).write(tmp_path)
+    other = Job(**{**JOB.settings(), "scenes": SCENES, "effects": ("ao",), "seed": 6})
+    with pytest.raises(DataError, match="seed 5"):
+        next(generate(other, tmp_path))
+
+
+def test_a_complete_set_needs_no_ray(tmp_path: Path, expected: dict[str, str]) -> None:
+    manifest = Manifest(JOB.settings(), {})
+    for k in range(JOB.shards):
+        manifest = manifest.with_shard(make_shard(JOB, k, tmp_path, lambda: None))
+    manifest.write(tmp_path)
+    assert list(generate(JOB, tmp_path)) == [(12, 12)]
+    check(tmp_path, expected)
+
+
+@contextlib.contextmanager
+def running(arguments: list[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """A command in a process group of its own, all of which is gone afterwards."""
+    process = subprocess.Popen(
+        arguments, start_new_session=True, stdout=subprocess.PIPE, cwd=ROOT, **options
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        if process.stdout:
+            process.stdout.close()
+
+
+def workers_of(parent: int) -> list[int]:
+    """Ray's task processes that descend from process `parent`."""
+    listing = subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True)
+    rows = [line.split(None, 2) for line in listing.stdout.splitlines()[1:]]
+    above = {int(pid): int(ppid) for pid, ppid, _ in rows}
+    found = []
+    for pid, _, args in rows:
+        ancestor = int(pid)
+        while ancestor in above and ancestor != parent:
+            ancestor = above[ancestor]
+        if ancestor == parent and args.startswith("ray::_shard_task"):
+            found.append(int(pid))
+    return found
+
+
+def wait_for(condition: Any, seconds: float = 120) -> Any:
+    """The first true value of `condition`, asked every 50 ms."""
+    limit = time.monotonic() + seconds
+    while time.monotonic() < limit:
+        if found := condition():
+            return found
+        time.sleep(0.05)
+    raise AssertionError("waited in vain")
+
+
+@pytest.mark.slow
+def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, expected: dict[str, str]) -> None:
+    with running([str(DEEPSHADE), "datagen", *command(tmp_path)]) as process:
+        victims = wait_for(lambda: workers_of(process.pid))
+        os.kill(victims[0], signal.SIGKILL)
+        assert process.wait(200) == 0
+    check(tmp_path, expected)
+
+
+@pytest.mark.slow
+def test_a_killed_job_goes_on(tmp_path: Path, expected: dict[str, str]) -> None:
+    with running([str(DEEPSHADE), "datagen", *command(tmp_path)]) as process:
+        wait_for(lambda: list(tmp_path.glob("shard-*")))
+        os.killpg(process.pid, signal.SIGKILL)
+    # What a kill in the middle of a write would leave:
+    done = subprocess.run(
+        [str(DEEPSHADE), "datagen", *command(tmp_path)], capture_output=True, timeout=200
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["views"] == 12
+    leftovers = [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+    for path in leftovers:  # readers ignore them: the manifest is what counts
+        path.unlink()
+    check(tmp_path, expected)
+
+
+@pytest.mark.slow
+def test_a_running_cluster_takes_jobs(tmp_path: Path, expected: dict[str, str]) -> None:
+    """As `ray job submit -- deepshade datagen`, as a script, and with --address."""
+    ray = str(Path(sys.executable).with_name("ray"))
+    environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0", "PATH": path_with_venv()}
+    environment.pop("RAY_ADDRESS", None)
+    ports = ["--port=9379", "--dashboard-port=9265", "--num-cpus=2"]
+    start = [ray, "start", "--head", "--block", "--include-dashboard=true", *ports]
+    with running(start, env=environment, stderr=subprocess.DEVNULL) as cluster:
+        api = "http://127.0.0.1:9265"
+
+        def submit(*arguments: str) -> bool:
+            done = subprocess.run(
+                [ray, "job", "submit", "--address", api, "--", *arguments],
+                env=environment,
+                capture_output=True,
+                timeout=240,
+            )
+            return done.returncode == 0
+
+        wait_for(lambda: cluster.poll() is None and submit("true"), 90)
+        assert submit(str(DEEPSHADE), "datagen", *command(tmp_path / "job"))
+        check(tmp_path / "job", expected)
+
+        address = {**environment, "RAY_ADDRESS": "127.0.0.1:9379"}
+        script = [sys.executable, str(ROOT / "scripts/ray_datagen.py")]
+        done = subprocess.run(
+            [*script, *command(tmp_path / "script")], env=address, capture_output=True, timeout=240
+        )
+        assert done.returncode == 0, done.stderr
+        check(tmp_path / "script", expected)
+
+
+def path_with_venv() -> str:
+    """PATH with this interpreter's scripts first, as an activated environment has it."""
+    return f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+
+
+@pytest.mark.slow
+def test_no_cluster_at_the_address(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [str(DEEPSHADE), "datagen", *command(tmp_path), "--address", "127.0.0.1:1"],
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 2
+    assert "no Ray cluster at" in done.stderr
+    assert "Traceback" not in done.stderr
