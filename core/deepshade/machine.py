@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -50,3 +51,15 @@ def memory_bytes(root: Path = _CGROUP) -> int:
             continue
         return min(total, limit) if total else limit
     return total
+
+
+def describe() -> str:
+    """The processor and how many CPUs we may use of it, for benchmarks and model cards."""
+    model = platform.processor() or platform.machine()
+    with suppress(OSError):  # only on Linux
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                model = value.strip()
+                break
+    return f"{model}, {cpu_count()} CPUs"

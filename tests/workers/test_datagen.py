@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -135,7 +136,7 @@ def test_a_complete_set_needs_no_ray(tmp_path: Path, expected: dict[str, str]) -
 def running(arguments: list[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """A command in a process group of its own, all of which is gone afterwards."""
     process = subprocess.Popen(
-        arguments, start_new_session=True, stdout=subprocess.PIPE, cwd=ROOT, **options
+        arguments, start_new_session=True, stdout=subprocess.DEVNULL, cwd=ROOT, **options
     )
     try:
         yield process
@@ -143,8 +144,6 @@ def running(arguments: list[str], **options: Any) -> Iterator[subprocess.Popen[b
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-        if process.stdout:
-            process.stdout.close()
 
 
 def workers_of(parent: int) -> list[int]:
@@ -203,12 +202,22 @@ def test_a_killed_job_goes_on(tmp_path: Path, expected: dict[str, str]) -> None:
 def test_a_running_cluster_takes_jobs(tmp_path: Path, expected: dict[str, str]) -> None:
     """As `ray job submit -- deepshade datagen`, as a script, and with --address."""
     ray = str(Path(sys.executable).with_name("ray"))
-    environment = {**os.environ, "RAY_USAGE_STATS_ENABLED": "0", "PATH": path_with_venv()}
+    environment = {
+        **os.environ,
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_AUTH_MODE": "token",  # as a cluster should: without one, anyone may run code there
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        "PATH": path_with_venv(),
+    }
     environment.pop("RAY_ADDRESS", None)
     ports = ["--port=9379", "--dashboard-port=9265", "--num-cpus=2"]
+    ports += ["--dashboard-agent-listen-port=9266"]
     start = [ray, "start", "--head", "--block", "--include-dashboard=true", *ports]
-    with running(start, env=environment, stderr=subprocess.DEVNULL) as cluster:
+    log = tmp_path / "ray.log"
+    with log.open("w") as out, running(start, env=environment, stderr=out) as cluster:
         api = "http://127.0.0.1:9265"
+
+        answers = []
 
         def submit(*arguments: str) -> bool:
             done = subprocess.run(
@@ -217,9 +226,13 @@ def test_a_running_cluster_takes_jobs(tmp_path: Path, expected: dict[str, str]) 
                 capture_output=True,
                 timeout=240,
             )
+            answers.append(done.stderr.decode()[-2000:])
             return done.returncode == 0
 
-        wait_for(lambda: cluster.poll() is None and submit("true"), 90)
+        try:
+            wait_for(lambda: cluster.poll() is None and submit("true"), 90)
+        except AssertionError:
+            raise AssertionError(f"no cluster: {log.read_text()} {answers[-1:]}") from None
         assert submit(str(DEEPSHADE), "datagen", *command(tmp_path / "job"))
         check(tmp_path / "job", expected)
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import platform
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -16,6 +14,7 @@ import numpy as np
 
 from deepshade.bundles import METRICS, Bundle
 from deepshade.files import replacing
+from deepshade.machine import describe
 
 from .evaluation import Shaded, Variant, evaluate, summary
 from .recipe import Recipe
@@ -62,21 +61,8 @@ def speed(bundle: Bundle, repeats: int = 9) -> dict[str, Any]:
         "size": [width, height],
         "engine": "ONNX Runtime fp32",
         "median_ms": round(float(np.median(times[2:])), 1),
-        "machine": machine(),
+        "machine": describe(),
     }
-
-
-def machine() -> str:
-    """Processor and cores, for reports."""
-    model = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                model = line.split(":", 1)[1].strip()
-                break
-    except OSError:
-        pass
-    return f"{model}, {len(os.sched_getaffinity(0))} cores"
 
 
 def write_card(bundle: Bundle, run: Run, note: str) -> None:

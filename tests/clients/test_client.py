@@ -1,0 +1,335 @@
+"""The Python API against a real service, a mock one, and transports that misbehave."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+
+import httpx
+import numpy as np
+import pytest
+
+import deepshade_client
+from deepshade_client import (
+    NO_RETRY,
+    AsyncClient,
+    BadAnswer,
+    BadRequest,
+    Busy,
+    Client,
+    ClientError,
+    ConnectionFailed,
+    MissingAttribute,
+    MockTransport,
+    NotReady,
+    Options,
+    Retry,
+    ServerFailed,
+    TimedOut,
+    Timeout,
+    TooLarge,
+)
+
+FAST = Retry(attempts=4, first=0.001, longest=0.01)
+
+
+@pytest.fixture(scope="module")
+def server(service):
+    return str(service.client.base_url)
+
+
+@pytest.fixture(autouse=True)
+def _no_proxies(monkeypatch):
+    for name in ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv(name.lower(), raising=False)
+
+
+def test_public_names():
+    """What users may import: exactly this, each documented."""
+    names = {
+        "AsyncClient Client Answer Options MockTransport Retry NO_RETRY Timeout ClientError",
+        "TransportError ConnectionFailed TimedOut ServerProblem BadRequest MissingAttribute",
+        "TooLarge Busy NotReady ServerFailed BadAnswer",
+    }
+    expected = {name for line in names for name in line.split()}
+    assert set(deepshade_client.__all__) == expected
+    assert deepshade_client.__all__ == sorted(
+        deepshade_client.__all__, key=lambda name: (not name.isupper(), name)
+    )
+    for name in expected:
+        thing = getattr(deepshade_client, name)
+        if inspect.isclass(thing):
+            assert thing.__doc__, name
+            assert issubclass(thing, ClientError) == issubclass(thing, Exception)
+
+
+def test_the_client_and_the_async_client_offer_the_same():
+    def public(cls):
+        return {name for name in vars(cls) if not name.startswith("_")}
+
+    assert public(Client) == public(AsyncClient)
+    for name in public(Client):
+        sync, asynchronous = (inspect.signature(getattr(c, name)) for c in (Client, AsyncClient))
+        assert sync == asynchronous, name
+
+
+def test_shade(server, make_exr, tmp_path):
+    path = tmp_path / "view.exr"
+    path.write_bytes(make_exr(24, 32))
+    with Client(server) as client:
+        answers = [
+            client.shade("ao", path, Options(radius=0.25, half=False)),
+            client.shade("ao", str(path), Options(radius=0.25, half=False)),
+            client.shade("ao", path.read_bytes(), Options(radius=0.25, half=False)),
+        ]
+    assert len({answer.content for answer in answers}) == 1
+    answer = answers[0]
+    assert answer.media_type == "image/x-exr"
+    assert answer.facts["radius"] == "0.25"
+    assert answer.facts["radius_source"] == "request"
+    assert list(answer.timing) == ["decode", "plan", "infer", "encode"]
+    (y,) = answer.channels().values()
+    assert y.shape == (24, 32)
+    saved = answer.save(tmp_path / "out.exr")
+    assert saved.read_bytes() == answer.content
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out.exr", "view.exr"]
+
+
+def test_every_option_reaches_the_service(server, make_exr, make_picture):
+    channels = {
+        name.replace("normal", "thing"): plane for name, plane in make_picture(8, 8).items()
+    }
+    options = Options(
+        radius=2,
+        fov=40.5,
+        profile="deepshade",
+        mapping={"normal": "thing"},
+        bundle="tiny",
+        compression="piz",
+        half=True,
+    )
+    with Client(server) as client:
+        answer = client.shade("ao", make_exr(channels), options)
+        png = client.shade("ao", make_exr(8, 8), Options(format="png"))
+    assert answer.facts["radius"] == "2"
+    assert "thing.X" in answer.facts["mapped"]
+    assert png.media_type == "image/png"
+    with pytest.raises(BadAnswer, match="can't be decoded"):
+        png.channels()
+
+
+def test_several_files_of_one_view(server, make_exr, make_picture, tmp_path):
+    channels = make_picture(8, 8)
+    paths = {}
+    for name in ("normal", "position"):
+        paths[name] = tmp_path / f"{name}.exr"
+        paths[name].write_bytes(make_exr({k: v for k, v in channels.items() if name in k}))
+    with Client(server) as client:
+        whole = client.shade("ao", make_exr(channels)).channels()["Y"]
+        listed = client.shade("ao", list(paths.values())).channels()["Y"]
+        named = client.shade("ao", paths).channels()["Y"]
+    np.testing.assert_array_equal(whole, listed)
+    np.testing.assert_array_equal(whole, named)
+
+
+def test_problems_become_exceptions(server, make_exr, make_picture):
+    with Client(server, retry=NO_RETRY) as client:
+        with pytest.raises(BadRequest, match="not an OpenEXR image") as caught:
+            client.shade("ao", b"hello")
+        assert (caught.value.status, caught.value.kind) == (400, "not-an-image")
+        assert caught.value.fix
+        with pytest.raises(BadRequest, match="no effect 'aoo'"):
+            client.shade("aoo", b"")
+        positions = {k: v for k, v in make_picture(4, 4).items() if "normal" in k}
+        with pytest.raises(MissingAttribute) as missing:
+            client.shade("ao", make_exr(positions))
+        assert missing.value.missing == ["position"]
+        assert "normal.X" in missing.value.found
+        with pytest.raises(BadRequest, match="radius"):
+            client.shade("ao", make_exr(4, 4), Options(radius=-1))
+
+
+def test_effects(server):
+    with Client(server) as client:
+        assert client.wait_until_ready()["status"] == "ready"
+        names = [effect["name"] for effect in client.effects()]
+        assert names[0] == "ao"
+        assert client.effect("ao")["bundles"][0]["name"] == "tiny"
+
+
+def test_async(server, make_exr):
+    async def work():
+        async with AsyncClient(server) as client:
+            bodies = [make_exr(8, 8 + n) for n in range(4)]
+            answers = await asyncio.gather(*(client.shade("ao", body) for body in bodies))
+            effects = await client.effects()
+            one = await client.effect("ao")
+            await client.wait_until_ready()
+            return answers, effects, one
+
+    answers, effects, one = asyncio.run(work())
+    assert [a.channels()["Y"].shape[1] for a in answers] == [8, 9, 10, 11]
+    assert effects[0] == one
+
+
+def test_mock_transport(make_exr):
+    mock = MockTransport(lambda gbuffer: 1 / -gbuffer.attributes["position"][2])
+    with Client(transport=mock) as client:
+        answer = client.shade("ao", make_exr(4, 6), Options(radius=2))
+        several = client.shade("ao", [make_exr(4, 6)])
+        with pytest.raises(BadRequest):
+            client.shade("ao", b"hello")
+        with pytest.raises(BadRequest, match="no /"):
+            client.shade("aoo", b"")
+        assert client.effect("ao")["bundles"][0]["name"] == "mock"
+        assert client.effects()[0]["name"] == "ao"
+    assert answer.facts["radius"] == "2.0"
+    assert answer.channels()["Y"].shape == (4, 6)
+    assert (answer.channels()["Y"] > 0.1).all()
+    np.testing.assert_array_equal(several.channels()["Y"], answer.channels()["Y"])
+    assert mock.requests[0].url.path == "/shade/ao"
+
+    async def work():
+        async with AsyncClient(transport=mock) as client:
+            return await client.shade("ao", make_exr(4, 6), Options(radius=2))
+
+    assert asyncio.run(work()).content == answer.content
+
+
+class Script(httpx.BaseTransport, httpx.AsyncBaseTransport):
+    """Plays back responses and exceptions, and counts the requests."""
+
+    def __init__(self, *steps):
+        self.steps = list(steps)
+        self.asked = 0
+
+    def handle_request(self, request):
+        self.asked += 1
+        step = self.steps.pop(0)
+        if isinstance(step, Exception):
+            raise step
+        # A response can be read once, so hand out a fresh one.
+        return httpx.Response(step.status_code, headers=step.headers, content=step.content)
+
+    async def handle_async_request(self, request):
+        return self.handle_request(request)
+
+
+def ok():
+    return httpx.Response(200, json=[])
+
+
+def failing(status, retry_after=None):
+    headers = {"Retry-After": retry_after} if retry_after else {}
+    return httpx.Response(status, json={"detail": f"it is {status}"}, headers=headers)
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        failing(429),
+        failing(503),
+        failing(429, "0"),
+        httpx.ConnectError("refused"),
+        httpx.ConnectTimeout("slow"),
+        httpx.ReadError("broken"),
+        httpx.RemoteProtocolError("closed"),
+    ],
+)
+def test_tries_again_what_may_succeed(failure):
+    script = Script(failure, failure, ok())
+    with Client(transport=script, retry=FAST) as client:
+        assert client.effects() == []
+    assert script.asked == 3
+
+    async def work():
+        async with AsyncClient(transport=Script(failure, ok()), retry=FAST) as client:
+            return await client.effects()
+
+    assert asyncio.run(work()) == []
+
+
+@pytest.mark.parametrize(
+    ("failure", "error"),
+    [
+        (failing(400), BadRequest),
+        (failing(404), BadRequest),
+        (failing(413), TooLarge),
+        (failing(422), BadRequest),
+        (failing(500), ServerFailed),
+        (failing(502), ServerFailed),
+        (httpx.ReadTimeout("slow"), TimedOut),
+        (httpx.Response(200, text="hello"), BadAnswer),
+        (httpx.Response(500, text="<html>"), ServerFailed),
+    ],
+)
+def test_does_not_try_again_what_cannot(failure, error):
+    script = Script(failure, ok())
+    with Client(transport=script, retry=FAST) as client, pytest.raises(error):
+        client.effects()
+    assert script.asked == 1
+
+
+@pytest.mark.parametrize(
+    ("failure", "error"),
+    [(failing(429), Busy), (failing(503), NotReady), (httpx.ConnectError("x"), ConnectionFailed)],
+)
+def test_gives_up_in_the_end(failure, error):
+    script = Script(*[failure] * 10)
+    with Client(transport=script, retry=FAST) as client, pytest.raises(error):
+        client.effects()
+    assert script.asked == FAST.attempts
+
+
+def test_pauses_grow_honour_retry_after_and_are_capped():
+    retry = Retry(attempts=10, first=1, longest=20)
+    pauses = [retry.pause(Busy(429, {}), attempt) for attempt in range(1, 10)]
+    for attempt, pause in enumerate(pauses[:4]):
+        assert 2**attempt <= pause <= 1.25 * 2**attempt
+    assert pauses[-1] == 20
+    assert retry.pause(Busy(429, {}), 10) is None
+    assert 7 <= retry.pause(Busy(429, {}, retry_after=7), 1) <= 8.75
+    assert retry.pause(Busy(429, {}, retry_after=10_000), 1) == 20
+    assert retry.pause(BadRequest(400, {}), 1) is None
+
+
+def test_retry_after_as_a_date():
+    from email.utils import formatdate
+    from time import time
+
+    script = Script(failing(429, formatdate(time() + 30, usegmt=True)))
+    with Client(transport=script, retry=NO_RETRY) as client, pytest.raises(Busy) as caught:
+        client.effects()
+    assert 25 < caught.value.retry_after <= 31
+
+
+def test_nobody_listens():
+    with (
+        Client("http://127.0.0.1:9", retry=NO_RETRY, timeout=Timeout(connect=1)) as client,
+        pytest.raises(ConnectionFailed, match=r"127\.0\.0\.1:9") as caught,
+    ):
+        client.effects()
+    assert "deepshade serve" in caught.value.fix
+
+
+def test_the_server_comes_from_the_environment(monkeypatch):
+    monkeypatch.setenv("DEEPSHADE_SERVER", "http://render.example:1234/shaders/")
+    with Client() as client:
+        assert client.server == "http://render.example:1234/shaders"
+    script = Script(ok())
+    with Client("http://x/y/", transport=script) as client:
+        client.effects()
+
+
+def test_a_path_in_front_of_the_service_is_kept():
+    paths = []
+
+    class Proxy(Script):
+        def handle_request(self, request):
+            paths.append(request.url.path)
+            return ok()
+
+    with Client("http://x/shaders/", transport=Proxy()) as client:
+        client.effects()
+    assert paths == ["/shaders/effects"]

@@ -1,0 +1,250 @@
+"""`deepshade-client`: which files go where, what is printed, and exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from deepshade import exr
+from deepshade_client import batch
+from deepshade_client.batch import UsageError, plan
+from deepshade_client.cli import main
+
+
+@pytest.fixture
+def run(service, capsys, monkeypatch):
+    for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("DEEPSHADE_SERVER", str(service.client.base_url))
+
+    def run(*arguments, code=0):
+        found = main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        assert found == code, err
+        return out, err
+
+    return run
+
+
+@pytest.fixture
+def views(tmp_path, make_exr):
+    """Three small pictures, one in a subfolder, and a file that is none."""
+    folder = tmp_path / "in"
+    (folder / "deep").mkdir(parents=True)
+    for name, width in (("a", 4), ("b", 5), ("deep/c", 6)):
+        (folder / f"{name}.exr").write_bytes(make_exr(4, width))
+    (folder / "notes.txt").write_text("hello")
+    return folder
+
+
+def targets(tasks):
+    return [str(task.target) for task in tasks]
+
+
+class TestPlan:
+    def plan(self, inputs, out, **options):
+        return plan(
+            [str(i) for i in inputs], str(out), **({"effect": "ao", "suffix": ".exr"} | options)
+        )
+
+    def test_one_file(self, views, tmp_path):
+        (task,) = self.plan([views / "a.exr"], tmp_path / "x.exr")
+        assert task.sources == (views / "a.exr",)
+        assert task.target == tmp_path / "x.exr"
+
+    def test_folder_keeps_names_and_subfolders(self, views, tmp_path):
+        tasks = self.plan([views], tmp_path / "out", suffix=".png")
+        names = [str(task.target.relative_to(tmp_path / "out")) for task in tasks]
+        assert names == ["a.png", "b.png", "deep/c.png"]
+
+    def test_glob(self, views, tmp_path):
+        tasks = self.plan([views / "**" / "*.exr"], f"{tmp_path}/out/")
+        assert [task.target.name for task in tasks] == ["a.exr", "b.exr", "c.exr"]
+
+    def test_pattern(self, views, tmp_path):
+        tasks = self.plan([views / "a.exr", views / "b.exr"], tmp_path / "{name}_{effect}.exr")
+        assert [task.target.name for task in tasks] == ["a_ao.exr", "b_ao.exr"]
+
+    def test_the_same_file_twice_is_shaded_once(self, views, tmp_path):
+        assert len(self.plan([views / "a.exr", views / "a.exr"], f"{tmp_path}/out/")) == 1
+
+    def test_together(self, views, tmp_path):
+        (task,) = self.plan([views / "a.exr", views / "b.exr"], tmp_path / "x.exr", together=True)
+        assert [path.name for path in task.sources] == ["a.exr", "b.exr"]
+
+    def test_outputs_within_the_input_folder_are_no_inputs(self, views):
+        out = views / "out"
+        out.mkdir()
+        (out / "a.exr").write_bytes(b"earlier")
+        assert len(self.plan([views], out)) == 3
+
+    @pytest.mark.parametrize(
+        ("inputs", "out", "message"),
+        [
+            (["a.exr", "b.exr"], "x.exr", "can't all go to the file"),
+            (["a.exr"], "a.exr", "is an input"),
+            (["a.exr"], "deep/../a.exr", "is an input"),
+            (["."], ".", "is an input"),
+            (["a.exr", "deep"], "same.exr/../{effect}.exr", "would both go"),
+            (["none.exr"], "x.exr", "no file, folder or match"),
+            (["*.hdr"], "x.exr", "no file, folder or match"),
+            (["a.exr"], "{nmae}.exr", "can't be filled in"),
+            (["a.exr"], "{0}.exr", "can't be filled in"),
+        ],
+    )
+    def test_refused(self, views, monkeypatch, inputs, out, message):
+        monkeypatch.chdir(views)
+        with pytest.raises(UsageError, match=message):
+            self.plan(inputs, out)
+
+    def test_a_folder_without_pictures(self, tmp_path):
+        with pytest.raises(UsageError, match=r"no \.exr files"):
+            self.plan([tmp_path], tmp_path / "x")
+
+    def test_a_link_to_an_input_is_an_input(self, views):
+        (views / "link.exr").symlink_to(views / "a.exr")
+        with pytest.raises(UsageError, match="is an input"):
+            self.plan([views / "a.exr"], views / "link.exr")
+
+
+def test_shade_one(run, views, tmp_path):
+    _, err = run("shade", "ao", views / "a.exr", "-o", tmp_path / "x.exr", "--radius", "0.3")
+    assert "✓" in err
+    header = exr.read_header(tmp_path / "x.exr").parts[0]
+    assert header.shape == (4, 4)
+    assert header.attributes["deepshade:radius"] == pytest.approx(0.3)
+
+
+def test_shade_a_folder_as_json(run, views, tmp_path):
+    out, err = run("shade", "ao", views, "-o", tmp_path / "out", "--json", "--float", "-j", "2")
+    assert err == ""
+    report = json.loads(out)
+    assert (report["saved"], report["failed"]) == (3, 0)
+    for entry, width in zip(report["pictures"], (4, 5, 6), strict=True):
+        assert entry["ok"]
+        assert entry["facts"]["bundle"] == "tiny"
+        assert set(entry["milliseconds"]) == {"decode", "plan", "infer", "encode"}
+        part = exr.read_header(entry["output"]).parts[0]
+        assert part.shape == (4, width)
+        assert part.channels == {"Y": "float"}
+
+
+@pytest.mark.parametrize(("option", "name"), [(["--png"], "x"), ([], "x.png")])
+def test_png(run, views, tmp_path, option, name):
+    run("shade", "ao", views / "a.exr", "-o", tmp_path / name, *option)
+    assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_together(run, make_exr, make_picture, tmp_path):
+    for name in ("normal", "position"):
+        channels = {k[-1]: v for k, v in make_picture(4, 4).items() if k.startswith(name)}
+        (tmp_path / f"{name}.exr").write_bytes(make_exr(channels))
+    inputs = [tmp_path / "normal.exr", tmp_path / "position.exr"]
+    run("shade", "ao", *inputs, "-o", tmp_path / "x.exr", "--together")
+    assert exr.read_header(tmp_path / "x.exr").parts[0].shape == (4, 4)
+
+
+def test_one_bad_picture_does_not_stop_the_others(run, views, tmp_path):
+    (views / "b.exr").write_bytes(b"hello")
+    out, err = run("shade", "ao", views, "-o", tmp_path / "out", "--json", code=1)
+    report = json.loads(out)
+    assert [entry["ok"] for entry in report["pictures"]] == [True, False, True]
+    assert report["pictures"][1]["error"]["status"] == 400
+    assert "not an OpenEXR image" in err
+    assert not (tmp_path / "out" / "b.exr").exists()
+
+
+def test_map_and_problems_with_their_fix(run, views, tmp_path):
+    _, err = run("shade", "aoo", views / "a.exr", "-o", tmp_path / "x.exr", code=1)
+    assert "did you mean 'ao'?" in err
+    _, err = run("shade", "ao", views / "a.exr", "-o", "x.exr", "--map", "normal", code=2)
+    assert "attribute=channel" in err
+    _, err = run("shade", "ao", views / "a.exr", "-o", views / "a.exr", code=2)
+    assert "is an input" in err
+    assert "fix:" in err
+
+
+def test_nobody_there(run, views, tmp_path):
+    arguments = ("shade", "ao", views, "-o", tmp_path / "out", "--server", "http://127.0.0.1:9")
+    out, err = run(*arguments, "--retries", "0", "--jobs", "1", "--json", code=3)
+    errors = [entry["error"]["detail"] for entry in json.loads(out)["pictures"]]
+    assert "can't connect" in errors[0]
+    assert errors[1] == errors[2] == "not tried: the service can't be reached"
+    _, err = run("effects", "--server", "http://127.0.0.1:9", code=3)
+    assert "deepshade serve" in err
+
+
+def test_effects_and_models(run):
+    out, _ = run("effects")
+    assert "Ambient occlusion" in out
+    assert "tiny" in out
+    out, _ = run("models", "--json")
+    (model,) = json.loads(out)
+    assert (model["effect"], model["name"]) == ("ao", "tiny")
+    out, _ = run("models")
+    assert "tiny" in out
+
+
+def test_several_are_in_flight(start, views, tmp_path, monkeypatch):
+    import asyncio
+    import threading
+
+    from deepshade_client import AsyncClient, Options
+
+    local = start(workers=3)
+    engine = local.service.models.pick("ao")
+    barrier, predict = threading.Barrier(3, timeout=10), engine.predict
+    engine.predict = lambda gbuffer: (barrier.wait(), predict(gbuffer))[1]
+    tasks = plan([str(views)], str(tmp_path / "out"), effect="ao", suffix=".exr")
+
+    async def work():
+        async with AsyncClient(str(local.client.base_url)) as client:
+            return await batch.run(client, "ao", tasks, Options(), jobs=3, done=lambda result: None)
+
+    assert all(result.error is None for result in asyncio.run(work()))
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_no_half_files(start, views, tmp_path):
+    """The service never answers; the command stops at once and says so."""
+    import threading
+
+    local = start(workers=1)
+    gate = threading.Event()
+    engine = local.service.models.pick("ao")
+    predict = engine.predict
+    engine.predict = lambda gbuffer: (gate.wait(20), predict(gbuffer))[1]
+    out = tmp_path / "out"
+    code = "import sys; from deepshade_client.cli import main; sys.exit(main())"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "shade", "ao", str(views), "-o", str(out)],
+        env=os.environ | {"DEEPSHADE_SERVER": str(local.client.base_url), "NO_PROXY": "*"},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 20
+    while not local.service.workers.taken:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=10)
+    gate.set()
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert not out.exists() or not list(out.rglob("*"))
+
+
+def test_imports_core_only():
+    code = (
+        "import sys, deepshade_client, deepshade_client.cli;"
+        "print([m for m in sys.modules if m.startswith(('deepshade_', 'torch', 'onnx', 'fastapi'))"
+        " and not m.startswith('deepshade_client')])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,138 @@
+"""Routes around the shading, the set-up, and how the process starts and stops."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import httpx
+import pytest
+
+from deepshade.effects import EFFECTS
+from deepshade.errors import ConfigError, DeepshadeError
+from deepshade_service.cli import listen
+from deepshade_service.config import Settings
+
+
+def test_effects(client):
+    effects = client.get("/effects").json()
+    assert [effect["name"] for effect in effects] == list(EFFECTS)
+    ao = client.get("/effects/ao").json()
+    assert ao == effects[0]
+    assert [entry["attribute"] for entry in ao["inputs"]] == ["normal", "position"]
+    (bundle,) = ao["bundles"]
+    assert bundle["name"] == "tiny"
+    assert bundle["metrics"] == {"dssim": 0.25}
+    assert bundle["radius"] == 0.5
+
+
+def test_schema_and_pages(client):
+    schema = client.get("/openapi.json").json()
+    post = schema["paths"]["/shade/{effect}"]["post"]
+    names = {parameter["name"] for parameter in post["parameters"]}
+    wanted = {
+        "effect",
+        "radius",
+        "fov",
+        "profile",
+        "map",
+        "bundle",
+        "format",
+        "compression",
+        "half",
+    }
+    assert names == wanted
+    assert {"image/x-exr", "multipart/form-data"} <= set(post["requestBody"]["content"])
+    assert {"200", "400", "404", "413", "415", "422", "429", "503"} <= set(post["responses"])
+    assert "swagger" in client.get("/docs").text
+    assert "/shade/ao" in client.get("/").text
+
+
+def test_metrics_count_by_route_not_by_path(client, make_exr):
+    client.post("/shade/ao", content=make_exr(4, 4), headers={"Content-Type": "image/x-exr"})
+    client.get("/made/up/path")
+    text = client.get("/metrics").text
+    assert 'deepshade_requests_total{route="/shade/{effect}",status="200"}' in text
+    assert "made" not in text
+    assert 'deepshade_stage_seconds_count{effect="ao",stage="infer"}' in text
+    assert "deepshade_resident_bytes" in text
+
+
+def test_import_is_light():
+    code = (
+        "import sys, deepshade_service, deepshade_service.app, deepshade_service.cli;"
+        "print([m for m in ('torch', 'ray', 'mitsuba', 'onnx', 'PIL') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_command_imports_light():
+    code = (
+        "import sys, deepshade_service.cli;"
+        "print([m for m in ('fastapi', 'onnxruntime', 'uvicorn') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_settings_name_the_key():
+    with pytest.raises(ConfigError, match="'workers' must be at least 1"):
+        Settings(workers=0)
+
+
+def test_a_taken_port_is_an_error_with_a_fix():
+    with (
+        listen("127.0.0.1", 0) as listener,
+        pytest.raises(DeepshadeError, match="can't listen") as caught,
+    ):
+        listen("127.0.0.1", listener.getsockname()[1])
+    assert "--port" in caught.value.fix
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_finish_requests_and_end_cleanly(start_server, make_exr, number):
+    server = start_server()
+    body = make_exr(900, 900)
+    results = []
+
+    def post():
+        response = httpx.post(
+            f"{server.url}/shade/ao",
+            content=body,
+            headers={"Content-Type": "image/x-exr"},
+            trust_env=False,
+            timeout=30,
+        )
+        results.append(response.status_code)
+
+    thread = threading.Thread(target=post)
+    idle = httpx.Client(trust_env=False)
+    idle.get(f"{server.url}/healthz")  # an open connection must not hold the end up
+    thread.start()
+    while "deepshade_jobs 0.0" in idle.get(f"{server.url}/metrics").text and not results:
+        time.sleep(0.002)
+    assert server.stop(number) == 0
+    thread.join()
+    idle.close()
+    assert results == [200]
+
+
+@pytest.mark.slow
+def test_serve_without_models_folder_is_a_usage_error(tmp_path):
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from deepshade.cli import main; sys.exit(main())",
+        "serve",
+    ]
+    done = subprocess.run(
+        [*command, "--models", str(tmp_path / "none")], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "there is no folder" in done.stderr
+    assert "Traceback" not in done.stderr
