@@ -1,0 +1,44 @@
+"""Python library and command line that talk to a deepshade service."""
+
+from deepshade_client.answer import Answer
+from deepshade_client.client import AsyncClient, Client
+from deepshade_client.exceptions import (
+    BadAnswer,
+    BadRequest,
+    Busy,
+    ClientError,
+    ConnectionFailed,
+    MissingAttribute,
+    NotReady,
+    ServerFailed,
+    ServerProblem,
+    TimedOut,
+    TooLarge,
+    TransportError,
+)
+from deepshade_client.mock import MockTransport
+from deepshade_client.request import Options
+from deepshade_client.settings import NO_RETRY, Retry, Timeout
+
+__all__ = [
+    "NO_RETRY",
+    "Answer",
+    "AsyncClient",
+    "BadAnswer",
+    "BadRequest",
+    "Busy",
+    "Client",
+    "ClientError",
+    "ConnectionFailed",
+    "MissingAttribute",
+    "MockTransport",
+    "NotReady",
+    "Options",
+    "Retry",
+    "ServerFailed",
+    "ServerProblem",
+    "TimedOut",
+    "Timeout",
+    "TooLarge",
+    "TransportError",
+]

@@ -1,0 +1,64 @@
+"""What the service sends back."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepshade import exr
+from deepshade.errors import ImageError
+from deepshade.files import replacing
+from deepshade_client.exceptions import BadAnswer
+
+_PREFIX = "deepshade-"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A shaded picture as it was received.
+
+    `content` is the file (`media_type` says EXR or PNG), `facts` what the service says about it
+    (bundle, radius, radius_source, derived, background_pixels, …), and `timing` the service's
+    milliseconds for each of its stages.
+    """
+
+    content: bytes
+    media_type: str
+    facts: Mapping[str, str]
+    timing: Mapping[str, float]
+
+    def save(self, path: Path | str) -> Path:
+        """Write the file; whatever was there is replaced only when all is written."""
+        target = Path(path)
+        with replacing(target) as temporary:
+            temporary.write_bytes(self.content)
+        return target
+
+    def channels(self) -> dict[str, NDArray[np.float32]]:
+        """The decoded EXR: (H, W) float32 under "Y", or "R", "G" and "B".
+
+        Raises BadAnswer when it is a PNG or can't be decoded.
+        """
+        try:
+            return exr.read(self.content).pixels
+        except ImageError as error:
+            raise BadAnswer(f"the answer ({self.media_type}) can't be decoded: {error}") from error
+
+
+def facts(headers: Mapping[str, str]) -> dict[str, str]:
+    """The Deepshade-* headers, as in "radius_source"."""
+    return {
+        name[len(_PREFIX) :].lower().replace("-", "_"): value
+        for name, value in headers.items()
+        if name.lower().startswith(_PREFIX)
+    }
+
+
+def timing(value: str) -> dict[str, float]:
+    """Milliseconds by stage from a Server-Timing header."""
+    return {name: float(ms) for name, ms in re.findall(r"([\w-]+);dur=(\d+(?:\.\d+)?)", value)}

@@ -1,0 +1,167 @@
+"""`deepshade-client`: shade pictures through a running service, and see what it offers.
+
+Exit codes: 0 all well, 1 some pictures failed, 2 wrong usage or input, 3 the service can't be
+reached or isn't ready, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from deepshade.cli import run
+from deepshade_client.exceptions import ClientError, NotReady, TransportError
+from deepshade_client.settings import DEFAULT_SERVER
+
+app = typer.Typer(
+    help="Shade G-buffers through a running deepshade service.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+Server = Annotated[
+    str,
+    typer.Option("--server", envvar="DEEPSHADE_SERVER", help="Address of the service."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output on stdout.")]
+
+
+@app.command()
+def shade(
+    effect: Annotated[str, typer.Argument(help="Which effect, for example ao.")],
+    inputs: Annotated[
+        list[str], typer.Argument(metavar="IN...", help="EXR files, folders, glob patterns.")
+    ],
+    out: Annotated[
+        str,
+        typer.Option(
+            "--out",
+            "-o",
+            help="A file, a folder, or a pattern with {name} and {effect}.",
+        ),
+    ],
+    radius: Annotated[float | None, typer.Option(help="Effect radius, scene units.")] = None,
+    fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    map_: Annotated[
+        list[str] | None,
+        typer.Option("--map", metavar="ATTR=CHANNEL", help="Where an attribute is; repeatable."),
+    ] = None,
+    profile: Annotated[str | None, typer.Option(help="Renderer whose names to expect.")] = None,
+    bundle: Annotated[str | None, typer.Option(help="Which of the effect's bundles.")] = None,
+    png: Annotated[bool, typer.Option("--png", help="8-bit sRGB PNG instead of EXR.")] = False,
+    compression: Annotated[str | None, typer.Option(help="Of the EXR, as zip or piz.")] = None,
+    full: Annotated[bool, typer.Option("--float", help="32-bit pixels instead of 16.")] = False,
+    together: Annotated[
+        bool, typer.Option("--together", help="All inputs are one view, one file per attribute.")
+    ] = False,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Requests in flight.")] = 3,
+    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for an answer.")] = 600.0,
+    retries: Annotated[int, typer.Option(min=0, help="Further attempts when it's busy.")] = 5,
+    server: Server = DEFAULT_SERVER,
+    as_json: AsJson = False,
+) -> None:
+    """Shade pictures and save the answers."""
+    from deepshade_client import batch, report
+    from deepshade_client.client import AsyncClient
+    from deepshade_client.request import Options
+    from deepshade_client.settings import Retry, Timeout
+
+    png = png or out.lower().endswith(".png")
+    tasks = batch.plan(
+        inputs, out, effect=effect, suffix=".png" if png else ".exr", together=together
+    )
+    options = Options(
+        radius=radius,
+        fov=fov,
+        profile=profile,
+        mapping=_mapping(map_ or []),
+        bundle=bundle,
+        format="png" if png else "exr",
+        compression=compression,
+        half=False if full else None,
+    )
+
+    async def shade_all() -> list[batch.Result]:
+        retry, wait = Retry(attempts=retries + 1), Timeout(answer=timeout)
+        async with AsyncClient(server, retry=retry, timeout=wait) as client:
+            with report.progress(len(tasks), quiet=as_json) as done:
+                return await batch.run(client, effect, tasks, options, jobs=jobs, done=done)
+
+    results = asyncio.run(shade_all())
+    if as_json:
+        _print_json(report.as_json(tasks, results))
+    failed = [result.error for result in results if result.error]
+    if failed and all(isinstance(error, TransportError | NotReady) for error in failed):
+        raise typer.Exit(3)
+    if failed:
+        raise typer.Exit(1)
+
+
+@app.command()
+def effects(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
+    """List the effects, their inputs, and which of them the service can shade."""
+    from deepshade_client import report
+
+    found = _effects(server)
+    if as_json:
+        _print_json(found)
+    else:
+        report.print_effects(found)
+
+
+@app.command()
+def models(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
+    """List the model bundles that the service has loaded."""
+    from deepshade_client import report
+
+    found = [
+        {"effect": effect["name"], **bundle}
+        for effect in _effects(server)
+        for bundle in effect["bundles"]
+    ]
+    if as_json:
+        _print_json(found)
+    else:
+        report.print_models(found)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the command; returns its exit code, and says on stderr what went wrong."""
+    try:
+        return run(typer.main.get_command(app), arguments, name="deepshade-client")
+    except ClientError as error:
+        print(f"error: {error}", file=sys.stderr)
+        if error.fix:
+            print(f"  fix: {error.fix}", file=sys.stderr)
+        return 3 if isinstance(error, TransportError | NotReady) else 2
+
+
+def _effects(server: str) -> list[dict[str, Any]]:
+    from deepshade_client.client import Client
+    from deepshade_client.settings import Retry
+
+    with Client(server, retry=Retry(attempts=2)) as client:
+        return client.effects()
+
+
+def _mapping(entries: list[str]) -> dict[str, str]:
+    mapping = {}
+    for entry in entries:
+        attribute, equals, channel = entry.partition("=")
+        if not (attribute and equals and channel):
+            raise typer.BadParameter(f"--map {entry}: write it as attribute=channel")
+        mapping[attribute] = channel
+    return mapping
+
+
+def _print_json(document: Any) -> None:
+    print(json.dumps(document, indent=2))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,167 @@
+"""The client, once blocking and once for asyncio."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import httpx
+
+from deepshade_client.answer import Answer
+from deepshade_client.exceptions import ClientError
+from deepshade_client.request import (
+    Options,
+    Picture,
+    get_request,
+    read_answer,
+    read_effects,
+    read_object,
+    shade_request,
+    transport_error,
+)
+from deepshade_client.settings import Retry, Timeout, default_server
+
+T = TypeVar("T")
+
+
+class Client:
+    """Talks to one service; may be shared by threads. Use it as a context manager, or `close` it.
+
+    `server` defaults to $DEEPSHADE_SERVER, else http://127.0.0.1:8000. `transport` replaces the
+    network (see `MockTransport`). Every method raises ClientError.
+    """
+
+    def __init__(
+        self,
+        server: str | None = None,
+        *,
+        timeout: Timeout | None = None,
+        retry: Retry | None = None,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.server = (server or default_server()).rstrip("/")
+        self._retry = retry or Retry()
+        self._http = httpx.Client(
+            base_url=self.server + "/",
+            timeout=(timeout or Timeout()).as_httpx(),
+            transport=transport,
+        )
+
+    def shade(self, effect: str, picture: Picture, options: Options | None = None) -> Answer:
+        """Shade a picture: a file, its bytes, several files of one view, or attribute -> file.
+
+        Also raises OSError for a file that can't be read.
+        """
+        return self._ask(shade_request(effect, picture, options or Options()), read_answer)
+
+    def effects(self) -> list[dict[str, Any]]:
+        """Every effect: name, title, inputs, outputs, and its bundles."""
+        return self._ask(get_request("effects"), read_effects)
+
+    def effect(self, name: str) -> dict[str, Any]:
+        """One effect, as in `effects`."""
+        return self._ask(get_request("effects", name), read_object)
+
+    def wait_until_ready(self) -> dict[str, Any]:
+        """Returns once the service's models are loaded, within what `Retry` allows."""
+        return self._ask(get_request("readyz"), read_object)
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _ask(self, request: dict[str, Any], read: Callable[[httpx.Response], T]) -> T:
+        attempt = 0
+        while True:
+            attempt += 1
+            try:
+                try:
+                    return read(self._http.request(**request))
+                except httpx.HTTPError as error:
+                    raise transport_error(error, self.server) from error
+            except ClientError as error:
+                pause = self._retry.pause(error, attempt)
+                if pause is None:
+                    raise
+            time.sleep(pause)
+
+
+class AsyncClient:
+    """`Client` for asyncio."""
+
+    def __init__(
+        self,
+        server: str | None = None,
+        *,
+        timeout: Timeout | None = None,
+        retry: Retry | None = None,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.server = (server or default_server()).rstrip("/")
+        self._retry = retry or Retry()
+        self._http = httpx.AsyncClient(
+            base_url=self.server + "/",
+            timeout=(timeout or Timeout()).as_httpx(),
+            transport=transport,
+        )
+
+    async def shade(self, effect: str, picture: Picture, options: Options | None = None) -> Answer:
+        """Like `Client.shade`; files are read in a thread."""
+        request = await asyncio.to_thread(shade_request, effect, picture, options or Options())
+        return await self._ask(request, read_answer)
+
+    async def effects(self) -> list[dict[str, Any]]:
+        """Like `Client.effects`."""
+        return await self._ask(get_request("effects"), read_effects)
+
+    async def effect(self, name: str) -> dict[str, Any]:
+        """Like `Client.effect`."""
+        return await self._ask(get_request("effects", name), read_object)
+
+    async def wait_until_ready(self) -> dict[str, Any]:
+        """Like `Client.wait_until_ready`."""
+        return await self._ask(get_request("readyz"), read_object)
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    async def _ask(self, request: dict[str, Any], read: Callable[[httpx.Response], T]) -> T:
+        attempt = 0
+        while True:
+            attempt += 1
+            try:
+                try:
+                    return read(await self._http.request(**request))
+                except httpx.HTTPError as error:
+                    raise transport_error(error, self.server) from error
+            except ClientError as error:
+                pause = self._retry.pause(error, attempt)
+                if pause is None:
+                    raise
+            await asyncio.sleep(pause)

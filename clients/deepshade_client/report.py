@@ -1,0 +1,110 @@
+"""What the command shows: progress and tables for people, documents for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from deepshade_client.batch import Result, Task
+from deepshade_client.exceptions import ServerProblem
+
+
+@contextmanager
+def progress(total: int, *, quiet: bool) -> Iterator[Callable[[Result], None]]:
+    """A progress bar on stderr and a line for each picture; only errors if `quiet`."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("shading"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    show = not quiet and total > 1 and console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=not show) as bar:
+        task = bar.add_task("", total=total)
+
+        def done(result: Result) -> None:
+            bar.advance(task)
+            if result.error:
+                _print_error(console, result)
+            elif not quiet:
+                console.print(_line(result), highlight=False, soft_wrap=True)
+
+        yield done
+
+
+def as_json(tasks: Sequence[Task], results: Sequence[Result]) -> dict[str, Any]:
+    """All results as one document, in the order of the tasks."""
+    by_task = {result.task: result for result in results}
+    return {
+        "pictures": [_entry(task, by_task.get(task)) for task in tasks],
+        "saved": sum(result.error is None for result in results),
+        "failed": len(tasks) - sum(result.error is None for result in results),
+    }
+
+
+def print_effects(effects: Sequence[dict[str, Any]]) -> None:
+    """A table of effects."""
+    table = Table("effect", "title", "inputs", "bundles")
+    for effect in effects:
+        table.add_row(
+            effect["name"],
+            effect["title"],
+            ", ".join(entry["attribute"] for entry in effect["inputs"]),
+            ", ".join(bundle["name"] for bundle in effect["bundles"]) or "[dim]none[/dim]",
+        )
+    Console().print(table)
+
+
+def print_models(models: Sequence[dict[str, Any]]) -> None:
+    """A table of bundles."""
+    table = Table("effect", "bundle", "radius", "engine", "precision", "sha256")
+    for model in models:
+        cells = ("effect", "name", "radius", "engine", "precision", "sha256")
+        table.add_row(*(escape(str(model.get(cell, ""))[:16]) for cell in cells))
+    Console().print(table)
+
+
+def _line(result: Result) -> str:
+    assert result.answer is not None
+    facts, timing = result.answer.facts, result.answer.timing
+    parts = [f"[green]✓[/green] {escape(str(result.task.target))}  {result.seconds:.2f} s"]
+    if timing:
+        parts.append(" ".join(f"{name} {ms:.0f}" for name, ms in timing.items()) + " ms")
+    if facts.get("derived"):
+        parts.append(f"derived {escape(facts['derived'])}")
+    if facts.get("nonfinite_pixels", "0") != "0":
+        parts.append(f"[yellow]{facts['nonfinite_pixels']} non-finite pixels[/yellow]")
+    return "  ·  ".join(parts)
+
+
+def _print_error(console: Console, result: Result) -> None:
+    source = escape(str(result.task.sources[0]))
+    console.print(
+        f"[red]✗[/red] {source}: {escape(str(result.error))}", highlight=False, soft_wrap=True
+    )
+    if fix := getattr(result.error, "fix", ""):
+        console.print(f"    {escape(fix)}", highlight=False, soft_wrap=True)
+
+
+def _entry(task: Task, result: Result | None) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "input": [str(path) for path in task.sources],
+        "output": str(task.target),
+        "ok": False,
+    }
+    if result is None:
+        return entry | {"error": {"detail": "not tried: the service can't be reached"}}
+    entry["seconds"] = round(result.seconds, 4)
+    if result.answer is not None and result.error is None:
+        facts = {"facts": dict(result.answer.facts), "milliseconds": dict(result.answer.timing)}
+        return entry | {"ok": True} | facts
+    error = result.error
+    document = error.document if isinstance(error, ServerProblem) else {"detail": str(error)}
+    return entry | {"error": document}

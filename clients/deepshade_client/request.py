@@ -1,0 +1,169 @@
+"""Building a request and reading its response; what the sync and the async client share."""
+
+from __future__ import annotations
+
+import email.utils
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote
+
+import httpx
+
+from deepshade_client.answer import Answer, facts, timing
+from deepshade_client.exceptions import (
+    BadAnswer,
+    ClientError,
+    ConnectionFailed,
+    TimedOut,
+    TransportError,
+    problem,
+)
+
+EXR = "image/x-exr"
+PNG = "image/png"
+
+Source = Path | str | bytes
+Picture = Source | Sequence[Source] | Mapping[str, Source]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """What a shading request may ask for; None leaves it to the service.
+
+    `radius` is in scene units, `fov` the full horizontal angle in degrees, `mapping` says which
+    layer or comma-separated channels hold an attribute, `half` asks for 16-bit pixels.
+    """
+
+    radius: float | None = None
+    fov: float | None = None
+    profile: str | None = None
+    mapping: Mapping[str, str] | None = None
+    bundle: str | None = None
+    format: Literal["exr", "png"] = "exr"
+    compression: str | None = None
+    half: bool | None = None
+
+    def query(self) -> list[tuple[str, str]]:
+        """As the parameters of the request."""
+        plain = {
+            "radius": None if self.radius is None else repr(float(self.radius)),
+            "fov": None if self.fov is None else repr(float(self.fov)),
+            "profile": self.profile,
+            "bundle": self.bundle,
+            "format": None if self.format == "exr" else self.format,
+            "compression": self.compression,
+            "half": None if self.half is None else str(self.half).lower(),
+        }
+        mapped = [("map", f"{name}={where}") for name, where in (self.mapping or {}).items()]
+        return [(name, value) for name, value in plain.items() if value is not None] + mapped
+
+
+def shade_request(effect: str, picture: Picture, options: Options) -> dict[str, Any]:
+    """The arguments of httpx's `request`; reads the files.
+
+    One file is sent as the body, several as a form. Raises OSError for a file that can't be read.
+    """
+    request: dict[str, Any] = {
+        "method": "POST",
+        "url": f"shade/{quote(effect, safe='')}",
+        "params": options.query(),
+    }
+    if isinstance(picture, (str, bytes, Path)):
+        _, data = _named(picture)
+        return request | {"content": data, "headers": {"Content-Type": EXR}}
+    named = picture.items() if isinstance(picture, Mapping) else [("image", s) for s in picture]
+    files = [(field, (*_named(source), EXR)) for field, source in named]
+    return request | {"files": files}
+
+
+def read_answer(response: httpx.Response) -> Answer:
+    """The picture of a response. Raises ServerProblem, BadAnswer."""
+    check(response)
+    media_type = response.headers.get("content-type", "").partition(";")[0]
+    if media_type not in (EXR, PNG):
+        raise BadAnswer(f"the answer is '{media_type}', not a picture")
+    return Answer(
+        response.content,
+        media_type,
+        facts(response.headers),
+        timing(response.headers.get("server-timing", "")),
+    )
+
+
+def get_request(*path: str) -> dict[str, Any]:
+    """The arguments of httpx's `request` for something to look up."""
+    return {"method": "GET", "url": "/".join(quote(step, safe="") for step in path)}
+
+
+def read_effects(response: httpx.Response) -> list[dict[str, Any]]:
+    """A list of effects. Raises ServerProblem, BadAnswer."""
+    effects = _json(response)
+    if not isinstance(effects, list):
+        raise BadAnswer("the answer is no list of effects; is this a deepshade service?")
+    return effects
+
+
+def read_object(response: httpx.Response) -> dict[str, Any]:
+    """One object, such as an effect. Raises ServerProblem, BadAnswer."""
+    document = _json(response)
+    if not isinstance(document, dict):
+        raise BadAnswer("the answer is no JSON object; is this a deepshade service?")
+    return document
+
+
+def _json(response: httpx.Response) -> Any:
+    check(response)
+    try:
+        return response.json()
+    except ValueError as error:
+        raise BadAnswer("the answer is no JSON; is this a deepshade service?") from error
+
+
+def check(response: httpx.Response) -> None:
+    """Raises the exception for a response that isn't a success."""
+    if response.is_success:
+        return
+    try:
+        document = response.json()
+    except ValueError:
+        document = None
+    if not isinstance(document, dict):
+        # Not from the service: a proxy in between, or something else at that address.
+        document = {"detail": f"HTTP {response.status_code} {response.reason_phrase}".strip()}
+    raise problem(response.status_code, document, _retry_after(response))
+
+
+def transport_error(error: httpx.HTTPError, server: str) -> ClientError:
+    """Our exception for one of httpx's."""
+    if isinstance(error, httpx.ConnectTimeout | httpx.ConnectError):
+        return ConnectionFailed(f"can't connect to {server}: {error}")
+    if isinstance(error, httpx.TimeoutException):
+        return TimedOut(f"{server} did not answer in time")
+    if isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError):
+        return ConnectionFailed(f"the connection to {server} broke: {error}")
+    return TransportError(f"the request to {server} failed: {error}")
+
+
+def _named(source: Source) -> tuple[str, bytes]:
+    if isinstance(source, bytes):
+        return "image.exr", source
+    path = Path(source)
+    return path.name, path.read_bytes()
+
+
+def _retry_after(response: httpx.Response) -> float | None:
+    """Seconds, from a number or an HTTP date."""
+    value = response.headers.get("retry-after", "").strip()
+    if not value:
+        return None
+    try:
+        return max(0.0, float(value))
+    except ValueError:
+        pass
+    try:
+        return max(0.0, email.utils.parsedate_to_datetime(value).timestamp() - time.time())
+    except ValueError:
+        return None

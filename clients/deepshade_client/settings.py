@@ -1,0 +1,64 @@
+"""Small value objects for a client's settings."""
+
+from __future__ import annotations
+
+import os
+import random
+from dataclasses import dataclass
+
+import httpx
+
+from deepshade_client.exceptions import Busy, ClientError, ConnectionFailed, NotReady
+
+DEFAULT_SERVER = "http://127.0.0.1:8000"
+
+
+def default_server() -> str:
+    """The address in $DEEPSHADE_SERVER, else this machine's port 8000."""
+    return os.environ.get("DEEPSHADE_SERVER") or DEFAULT_SERVER
+
+
+@dataclass(frozen=True, slots=True)
+class Timeout:
+    """Seconds to wait: for a connection, for each piece sent, and for the answer to begin.
+
+    A picture may wait in the service's queue, so `answer` is long.
+    """
+
+    connect: float = 5.0
+    send: float = 60.0
+    answer: float = 600.0
+
+    def as_httpx(self) -> httpx.Timeout:
+        """The same for httpx."""
+        return httpx.Timeout(
+            connect=self.connect, write=self.send, read=self.answer, pool=self.answer
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Retry:
+    """How often to try again, and how long to wait in between.
+
+    Only what may succeed unchanged is tried again: a failed connection, a full queue (429), a
+    service that isn't ready (503). The wait doubles from `first` up to `longest` seconds, with
+    up to a quarter of random extra so that many clients don't come back at once; the service's
+    Retry-After counts if it is longer, but never more than `longest`.
+    """
+
+    attempts: int = 6
+    first: float = 0.25
+    longest: float = 30.0
+
+    def pause(self, error: ClientError, attempt: int) -> float | None:
+        """Seconds to wait after the `attempt`-th failure (from 1); None: don't try again."""
+        if attempt >= self.attempts or not isinstance(error, (ConnectionFailed, Busy, NotReady)):
+            return None
+        wait = self.first * 2.0 ** (attempt - 1)
+        asked = getattr(error, "retry_after", None)
+        if asked is not None:
+            wait = max(wait, asked)
+        return min(self.longest, wait * random.uniform(1.0, 1.25))
+
+
+NO_RETRY = Retry(attempts=1)

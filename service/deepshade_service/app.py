@@ -1,0 +1,263 @@
+"""The HTTP service: routes, and what starts and stops with it."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Awaitable
+from contextlib import asynccontextmanager, suppress
+from importlib.metadata import version
+from importlib.resources import files
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Query, Request, Response
+from fastapi.responses import HTMLResponse, PlainTextResponse
+
+from deepshade.attributes import ATTRIBUTES
+from deepshade.effects import EFFECTS
+from deepshade_service import problems
+from deepshade_service.config import Settings
+from deepshade_service.engine import Engine
+from deepshade_service.job import Answer, Job
+from deepshade_service.memory import MemoryBudget, trim
+from deepshade_service.middleware import Counting
+from deepshade_service.models import Models, find_effect, not_ready
+from deepshade_service.parameters import ShadeParameters
+from deepshade_service.pool import Cancelled, Workers
+from deepshade_service.telemetry import MEDIA_TYPE as METRICS_TYPE
+from deepshade_service.telemetry import Telemetry
+from deepshade_service.uploads import Uploads
+
+
+class Service:
+    """What the routes share: settings, models, workers, memory, counters."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.models = Models(settings.models, threads=settings.threads)
+        self.workers = Workers(settings.workers, settings.queue)
+        self.uploads = Uploads(settings)
+        self.memory = MemoryBudget(settings.memory)
+        self.telemetry = Telemetry(
+            queued=lambda: self.workers.taken, held=lambda: self.uploads.held
+        )
+
+    @asynccontextmanager
+    async def running(self, app: FastAPI) -> AsyncIterator[None]:
+        """Load models in the background, so that /healthz answers meanwhile; stop in the end."""
+        tasks = [
+            asyncio.create_task(asyncio.to_thread(self.models.load)),
+            asyncio.create_task(self._tidy()),
+        ]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.to_thread(self.workers.stop)
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def shade(self, effect: str, request: Request, asked: ShadeParameters) -> Answer:
+        """Receive, queue and shade one picture."""
+        engine = self.models.pick(effect, asked.bundle)
+        self.workers.check_room()  # before the body is received, to spare both sides the work
+        async with self.uploads.receive(request) as uploads:
+            job = Job(engine, uploads, asked, self.settings.limits, self.memory)
+            answer = await _unless_gone(request, self.workers.run(job))
+        self.telemetry.shaded(
+            effect, answer.watch, answer.pixels, int(answer.facts["nonfinite_pixels"])
+        )
+        return answer
+
+    async def _tidy(self) -> None:
+        """Give memory back when nothing has been shaded for a while."""
+        tidied = time.monotonic()
+        while True:
+            await asyncio.sleep(self.settings.idle_trim / 2)
+            ended = self.workers.last_end
+            idle = time.monotonic() - ended
+            if ended > tidied and not self.workers.taken and idle > self.settings.idle_trim:
+                tidied = time.monotonic()
+                await asyncio.to_thread(self._release)
+
+    def _release(self) -> None:
+        for engine in self.models:
+            engine.shrink()
+        trim()
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The ASGI application for these settings."""
+    service = Service(settings or Settings())
+    app = FastAPI(
+        title="deepshade",
+        version=version("deepshade"),
+        summary="Neural screen-space shading: a G-buffer in, shaded appearance out.",
+        lifespan=service.running,
+    )
+    app.state.service = service
+    problems.install(app)
+    app.add_middleware(Counting, telemetry=service.telemetry)
+
+    @app.post(
+        "/shade/{effect}",
+        tags=["shade"],
+        summary="Shade a G-buffer",
+        response_class=Response,
+        responses=_SHADE_RESPONSES,
+        openapi_extra={"requestBody": _SHADE_BODY},
+    )
+    async def shade(
+        effect: str, request: Request, asked: Annotated[ShadeParameters, Query()]
+    ) -> Response:
+        """Send one EXR as the body, or one or several as the files of a form.
+
+        Takes any size from 1x1 up. Pixels that aren't finite are background. The answer's
+        headers, and its EXR header, say how it was made.
+        """
+        try:
+            answer = await service.shade(effect, request, asked)
+        except Cancelled:
+            return Response(status_code=503)  # nobody is there to read it
+        headers = {_header_name(name): _header_value(v) for name, v in answer.facts.items()}
+        headers["Server-Timing"] = answer.watch.server_timing()
+        return Response(answer.content, media_type=answer.media_type, headers=headers)
+
+    @app.get("/effects", tags=["effects"], summary="All effects and their bundles")
+    async def effects() -> list[dict[str, Any]]:
+        return [_effect(name, service.models.bundles(name)) for name in EFFECTS]
+
+    @app.get("/effects/{effect}", tags=["effects"], summary="One effect: inputs, bundles, metrics")
+    async def one_effect(effect: str) -> dict[str, Any]:
+        return _effect(find_effect(effect).name, service.models.bundles(effect))
+
+    @app.get("/healthz", tags=["operation"], summary="Is the process alive?")
+    async def healthz() -> dict[str, str]:
+        return {"status": "ok"}
+
+    @app.get("/readyz", tags=["operation"], summary="Are the models loaded and warm?")
+    async def readyz() -> dict[str, Any]:
+        if not service.models.ready:
+            raise not_ready(service.models)
+        bundles = [f"{engine.bundle.effect}/{engine.bundle.name}" for engine in service.models]
+        return {"status": "ready", "bundles": bundles, "refused": service.models.refused}
+
+    @app.get("/metrics", tags=["operation"], summary="Counters, for Prometheus")
+    async def metrics() -> Response:
+        return PlainTextResponse(service.telemetry.render(), media_type=METRICS_TYPE)
+
+    page = files("deepshade_service").joinpath("index.html").read_text("utf-8")
+
+    @app.get("/", include_in_schema=False)
+    async def index() -> HTMLResponse:
+        return HTMLResponse(page)
+
+    return app
+
+
+async def _unless_gone(request: Request, work: Awaitable[Answer]) -> Answer:
+    """The work's result; if the client disconnects first the work is cancelled."""
+    job = asyncio.ensure_future(work)
+    gone = asyncio.ensure_future(_gone(request))
+    try:
+        await asyncio.wait({job, gone}, return_when=asyncio.FIRST_COMPLETED)
+        if not job.done():
+            raise Cancelled
+        return job.result()
+    finally:
+        for task in (job, gone):
+            task.cancel()
+            with suppress(asyncio.CancelledError, Exception):
+                await task
+
+
+async def _gone(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+def _effect(name: str, engines: list[Engine]) -> dict[str, Any]:
+    effect = EFFECTS[name]
+    return {
+        "name": name,
+        "title": effect.title,
+        "inputs": [
+            {"attribute": i, "channels": ATTRIBUTES[i].channels, "meaning": ATTRIBUTES[i].meaning}
+            for i in effect.inputs
+        ],
+        "outputs": effect.outputs,
+        "reference": effect.reference,
+        "bundles": [_bundle(engine) for engine in engines],
+    }
+
+
+def _bundle(engine: Engine) -> dict[str, Any]:
+    bundle = engine.bundle
+    return {
+        "name": bundle.name,
+        "sha256": bundle.sha256,
+        "inputs": bundle.inputs,
+        "radius": bundle.radius,
+        "size_multiple": bundle.size_multiple,
+        "halo": bundle.halo,
+        "engine": engine.name,
+        "precision": engine.precision,
+        "metrics": bundle.metrics,
+    }
+
+
+def _header_name(fact: str) -> str:
+    return "Deepshade-" + fact.replace("_", "-").title()
+
+
+def _header_value(value: object) -> str:
+    """Printable ASCII: channel names come from strangers and may hold anything."""
+    text = f"{value:.9g}" if isinstance(value, float) else str(value)
+    return "".join(c if " " <= c <= "~" else "?" for c in text)[:2000].strip()
+
+
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_SHADE_BODY = {
+    "required": True,
+    "content": {
+        "image/x-exr": _BINARY,
+        "application/octet-stream": _BINARY,
+        "multipart/form-data": {
+            "schema": {
+                "type": "object",
+                "description": "EXR files: one, one for each attribute, or several parts.",
+                "additionalProperties": _BINARY["schema"],
+            }
+        },
+    },
+}
+_PROBLEM = {
+    "type": "object",
+    "required": ["type", "title", "status", "detail"],
+    "properties": {
+        "type": {"type": "string"},
+        "title": {"type": "string"},
+        "status": {"type": "integer"},
+        "detail": {"type": "string"},
+        "fix": {"type": "string"},
+    },
+}
+_SHADE_RESPONSES: dict[int | str, Any] = {
+    200: {
+        "description": "The shaded picture",
+        "content": {"image/x-exr": _BINARY, "image/png": _BINARY},
+    }
+}
+_SHADE_RESPONSES |= {
+    status: {"description": text, "content": {problems.MEDIA_TYPE: {"schema": _PROBLEM}}}
+    for status, text in {
+        400: "No EXR, or a damaged one",
+        404: "Unknown effect, or no bundle for it",
+        408: "The body arrived too slowly",
+        413: "Over a limit",
+        415: "Another content type than EXR or a form",
+        422: "A missing attribute or a bad parameter",
+        429: "The queue is full; see Retry-After",
+        503: "The models aren't loaded yet",
+    }.items()
+}

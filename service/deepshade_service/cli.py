@@ -1,0 +1,132 @@
+"""`deepshade serve`."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from deepshade_service.config import Settings
+
+
+def serve(
+    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 8000,
+    models: Annotated[
+        Path, typer.Option(help="Folder of bundles, <effect>/<name>/.", envvar="DEEPSHADE_MODELS")
+    ] = Path("models"),
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="Of a network run. Default: the CPUs we may use.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Pictures shaded at a time.")] = 2,
+    queue: Annotated[int, typer.Option(min=0, help="Pictures that may wait; then 429.")] = 16,
+    memory: Annotated[
+        str | None,
+        typer.Option(help="For pixels and networks, as 2G. Default: half of the machine's."),
+    ] = None,
+    max_body: Annotated[str | None, typer.Option(help="Largest body, as 500M.")] = None,
+    max_decoded: Annotated[str | None, typer.Option(help="Largest decoded file.")] = None,
+    max_pixels: Annotated[int | None, typer.Option(min=1, help="Most pixels of a part.")] = None,
+    max_parts: Annotated[int | None, typer.Option(min=1, help="Most parts of a file.")] = None,
+    max_channels: Annotated[
+        int | None, typer.Option(min=1, help="Most channels of a file.")
+    ] = None,
+    body_timeout: Annotated[float, typer.Option(help="Seconds for a body to arrive.")] = 60.0,
+    grace: Annotated[float, typer.Option(help="Seconds to finish work at the end.")] = 20.0,
+    log_level: Annotated[str, typer.Option(help="critical, error, warning, info.")] = "info",
+) -> None:
+    """Serve the shaders over HTTP."""
+    from deepshade.errors import ConfigError
+    from deepshade.exr import Limits
+    from deepshade_service.config import Settings
+    from deepshade_service.memory import parse_size
+
+    if not models.is_dir():
+        raise ConfigError(
+            "models", detail=f"there is no folder {models}; --models says where the bundles are"
+        )
+    limits = {
+        "body_bytes": parse_size(max_body) if max_body else None,
+        "decoded_bytes": parse_size(max_decoded) if max_decoded else None,
+        "pixels": max_pixels,
+        "parts": max_parts,
+        "channels": max_channels,
+    }
+    chosen = {"threads": threads, "memory": parse_size(memory) if memory else None}
+    settings = Settings(
+        models=models,
+        limits=Limits(**{name: value for name, value in limits.items() if value is not None}),
+        workers=workers,
+        queue=queue,
+        body_timeout=body_timeout,
+        grace=grace,
+        **{name: value for name, value in chosen.items() if value is not None},
+    )
+    with listen(host, port) as listener:
+        _run(settings, listener, log_level)
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A listening socket; its port is known before the server starts, also when it was 0.
+
+    Its protocol is stated, because asyncio sets TCP_NODELAY only on sockets that say TCP, and
+    without it every small answer takes 40 ms (Nagle's algorithm against delayed acknowledgement).
+    """
+    from deepshade.errors import DeepshadeError
+
+    listener = None
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(2048)
+    except OSError as error:
+        if listener is not None:
+            listener.close()
+        raise DeepshadeError(
+            f"can't listen at {host}, port {port}: {error.strerror or error}",
+            fix="choose another --port (0 takes a free one) or --host",
+        ) from error
+    return listener
+
+
+def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
+    import uvicorn
+
+    from deepshade_service.app import create_app
+
+    host, port = listener.getsockname()[:2]
+    shown = f"[{host}]" if ":" in host else host
+    print(f"deepshade is serving at http://{shown}:{port} (Ctrl-C stops it)", flush=True)
+    config = uvicorn.Config(
+        create_app(settings),
+        log_config=_logging(log_level),
+        # Without it uvicorn waits for open sockets for ever.
+        timeout_graceful_shutdown=max(1, round(settings.grace)),
+        server_header=False,
+    )
+    # uvicorn shuts down at SIGINT and SIGTERM and raises them again afterwards. By then all is
+    # tidy, so they shall neither print a traceback nor turn a clean end into a failure.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
+    uvicorn.Server(config).run(sockets=[listener])
+
+
+def _logging(level: str) -> dict[str, Any]:
+    """uvicorn's own set-up, and ours beside it."""
+    from copy import deepcopy
+
+    from uvicorn.config import LOGGING_CONFIG
+
+    logging = deepcopy(LOGGING_CONFIG)
+    for name in ("uvicorn", "uvicorn.access", "deepshade"):
+        logging["loggers"].setdefault(name, {"handlers": ["default"], "propagate": False})
+        logging["loggers"][name]["level"] = level.upper()
+    return logging

@@ -1,0 +1,74 @@
+"""The parameters of a shading request, as the query string carries them."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from deepshade.exr import COMPRESSIONS
+from deepshade.profiles import PROFILES
+
+# Far beyond any scene, and safely inside what float32 can divide by.
+MIN_RADIUS, MAX_RADIUS = 1e-30, 1e30
+
+Compression = StrEnum("Compression", {name: name for name in COMPRESSIONS})  # type: ignore[misc]
+Profile = StrEnum("Profile", {name: name for name in PROFILES})  # type: ignore[misc]
+
+
+class ShadeParameters(BaseModel):
+    """What a request may ask for. An unknown parameter is an error, not a silent no-op."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    radius: Annotated[
+        float | None,
+        Field(
+            ge=MIN_RADIUS,
+            le=MAX_RADIUS,
+            allow_inf_nan=False,
+            description="The effect's radius in scene units. Else the header's `deepshade:radius`,"
+            " else the bundle's own.",
+        ),
+    ] = None
+    fov: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            lt=180,
+            allow_inf_nan=False,
+            description="Full horizontal field of view in degrees, where positions have to be"
+            " derived from depth and the header doesn't say.",
+        ),
+    ] = None
+    profile: Annotated[
+        Profile | None, Field(description="The renderer whose channel names to expect.")
+    ] = None
+    map: Annotated[
+        list[str],
+        Field(description="`attribute=channel or layer`, repeatable: where an attribute is."),
+    ] = []
+    bundle: Annotated[
+        str | None, Field(description="Which of the effect's bundles; else its first.")
+    ] = None
+    format: Annotated[
+        Literal["exr", "png"],
+        Field(description="`png` is 8-bit sRGB, for eyes; `exr` is linear, for work."),
+    ] = "exr"
+    compression: Annotated[Compression, Field(description="Of the EXR.")] = Compression("zip")
+    half: Annotated[bool, Field(description="16-bit pixels in the EXR, else 32-bit.")] = True
+
+    @field_validator("map")
+    @classmethod
+    def _check_map(cls, entries: list[str]) -> list[str]:
+        for entry in entries:
+            attribute, equals, channel = entry.partition("=")
+            if not (attribute and equals and channel):
+                raise ValueError(f"'{entry[:100]}' is not attribute=channel")
+        return entries
+
+    @property
+    def mapping(self) -> dict[str, str]:
+        """`map` as attribute -> channel or layer."""
+        return {entry.partition("=")[0]: entry.partition("=")[2] for entry in self.map}

@@ -1,0 +1,140 @@
+"""Every error as an RFC 9457 problem document: what was wrong, where, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from deepshade.errors import (
+    AmbiguousChannelError,
+    BundleError,
+    CameraError,
+    ConfigError,
+    DamagedImageError,
+    DeepshadeError,
+    ImageError,
+    LimitError,
+    MissingAttributeError,
+)
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class Problem(Exception):
+    """A problem that the service itself finds; `kind` ends the document's type URI."""
+
+    def __init__(
+        self,
+        status: int,
+        kind: str,
+        detail: str,
+        *,
+        fix: str = "",
+        headers: Mapping[str, str] | None = None,
+        **more: Any,
+    ) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.kind = kind
+        self.detail = detail
+        self.headers = dict(headers or {})
+        self.more = {"fix": fix, **more} if fix else more
+
+
+# The first match counts, so subclasses come before their parents.
+_KINDS: tuple[tuple[type[DeepshadeError], int, str], ...] = (
+    (DamagedImageError, 400, "damaged-image"),
+    (ImageError, 400, "not-an-image"),
+    (LimitError, 413, "over-limit"),
+    (MissingAttributeError, 422, "missing-attribute"),
+    (AmbiguousChannelError, 422, "ambiguous-channel"),
+    (CameraError, 422, "no-camera"),
+    (ConfigError, 422, "bad-parameter"),
+    (BundleError, 500, "bad-bundle"),
+    (DeepshadeError, 422, "unusable-input"),
+)
+_FACTS = ("missing", "found", "near", "attribute", "candidates", "limit", "value", "maximum")
+_MOST = 200  # entries of a list; a file may have thousands of channels
+
+
+def from_error(error: DeepshadeError) -> Problem:
+    """The problem that an error of the core package is, with the facts that it carries."""
+    status, kind = next((s, k) for cls, s, k in _KINDS if isinstance(error, cls))
+    facts = {name: _short(getattr(error, name)) for name in _FACTS if hasattr(error, name)}
+    return Problem(status, kind, str(error), fix=error.fix, **facts)
+
+
+def respond(problem: Problem) -> JSONResponse:
+    """The problem as a response."""
+    return JSONResponse(
+        {
+            "type": f"urn:deepshade:problem:{problem.kind}",
+            "title": HTTPStatus(problem.status).phrase,
+            "status": problem.status,
+            "detail": problem.detail,
+            **problem.more,
+        },
+        status_code=problem.status,
+        media_type=MEDIA_TYPE,
+        headers=problem.headers,
+    )
+
+
+def install(app: FastAPI) -> None:
+    """Make `app` answer every error as a problem document."""
+
+    @app.exception_handler(Problem)
+    async def _(request: Request, error: Problem) -> JSONResponse:
+        return respond(error)
+
+    @app.exception_handler(DeepshadeError)
+    async def _(request: Request, error: DeepshadeError) -> JSONResponse:
+        return respond(from_error(error))
+
+    @app.exception_handler(HTTPException)
+    async def _(request: Request, error: HTTPException) -> JSONResponse:
+        kind = HTTPStatus(error.status_code).phrase.lower().replace(" ", "-")
+        detail = f"{request.method} {request.url.path}: {error.detail}"
+        fix = "see /docs for what there is" if error.status_code in (404, 405) else ""
+        return respond(
+            Problem(error.status_code, kind, detail, fix=fix, headers=error.headers or {})
+        )
+
+    @app.exception_handler(RequestValidationError)
+    async def _(request: Request, error: RequestValidationError) -> JSONResponse:
+        errors = [
+            {
+                "where": ".".join(str(step) for step in entry["loc"]),
+                "problem": entry["msg"],
+                "got": str(entry.get("input"))[:200],
+            }
+            for entry in error.errors()
+        ]
+        detail = "; ".join(f"{entry['where']}: {entry['problem']}" for entry in errors)
+        return respond(Problem(422, "bad-parameter", detail, errors=errors))
+
+    @app.exception_handler(Exception)
+    async def _(request: Request, error: Exception) -> JSONResponse:
+        # The traceback goes to the log (the server writes it); the client learns only this.
+        return respond(
+            Problem(
+                500,
+                "internal",
+                "the service failed on this request; its log has the details",
+                fix="report it with the request that caused it",
+            )
+        )
+
+
+def _short(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _short(entry) for name, entry in list(value.items())[:_MOST]}
+    if isinstance(value, tuple | list | set):
+        return [str(entry)[:200] for entry in list(value)[:_MOST]]
+    return value

@@ -1,0 +1,85 @@
+"""What the service counts (Prometheus), and the clock behind Server-Timing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+from deepshade_service.memory import resident
+
+MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+_SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 30, 60)
+
+
+class Stopwatch:
+    """Milliseconds of named stages, in the order in which they ran."""
+
+    def __init__(self) -> None:
+        self.milliseconds: dict[str, float] = {}
+
+    @contextmanager
+    def time(self, stage: str) -> Iterator[None]:
+        """Add the block's duration to `stage`."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            took = 1e3 * (time.perf_counter() - start)
+            self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + took
+
+    def server_timing(self) -> str:
+        """As the value of a Server-Timing header."""
+        return ", ".join(f"{name};dur={ms:.2f}" for name, ms in self.milliseconds.items())
+
+
+class Telemetry:
+    """One service's counters. Each service has its own registry, so that tests can run several."""
+
+    def __init__(self, *, queued: Callable[[], float], held: Callable[[], float]) -> None:
+        self._registry = CollectorRegistry()
+        self._requests = Counter(
+            "deepshade_requests",
+            "Requests answered, by route and status",
+            ["route", "status"],
+            registry=self._registry,
+        )
+        self._stages = Histogram(
+            "deepshade_stage_seconds",
+            "Time of each stage of a shaded picture",
+            ["effect", "stage"],
+            buckets=_SECONDS,
+            registry=self._registry,
+        )
+        self._pixels = Counter(
+            "deepshade_pixels", "Pixels shaded", ["effect"], registry=self._registry
+        )
+        self._nonfinite = Counter(
+            "deepshade_nonfinite_pixels",
+            "Pixels with a NaN or an infinity, treated as background",
+            ["effect"],
+            registry=self._registry,
+        )
+        for name, text, read in (
+            ("deepshade_jobs", "Pictures being shaded or waiting", queued),
+            ("deepshade_upload_bytes", "Bytes of bodies held in memory", held),
+            ("deepshade_resident_bytes", "Physical memory of the process", resident),
+        ):
+            Gauge(name, text, registry=self._registry).set_function(read)
+
+    def answered(self, route: str, status: int) -> None:
+        """Count a response."""
+        self._requests.labels(route, str(status)).inc()
+
+    def shaded(self, effect: str, watch: Stopwatch, pixels: int, nonfinite: int) -> None:
+        """Count a shaded picture."""
+        for stage, ms in watch.milliseconds.items():
+            self._stages.labels(effect, stage).observe(ms / 1e3)
+        self._pixels.labels(effect).inc(pixels)
+        self._nonfinite.labels(effect).inc(nonfinite)
+
+    def render(self) -> bytes:
+        """All counters in Prometheus' text format."""
+        return generate_latest(self._registry)
