@@ -66,11 +66,12 @@ def below(rows: Sequence[Picture]) -> Picture:
 
 
 def png(picture: Picture) -> bytes:
-    """The bytes of a PNG file."""
+    """The bytes of a PNG file; grey pictures have one channel."""
     from PIL import Image
 
+    grey = (picture == picture[..., :1]).all()
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "PNG", compress_level=6)
+    Image.fromarray(picture[..., 0] if grey else picture).save(buffer, "PNG", compress_level=3)
     return buffer.getvalue()
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade import exr
+from deepshade import exr, pictures
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.gbuffer import GBuffer, load_gbuffer
@@ -114,7 +114,7 @@ def encode(
 ) -> tuple[bytes, str]:
     """The answer's bytes and media type. `part` gives the windows; `facts` go into the header."""
     if asked.format == "png":
-        return _png(shade), "image/png"
+        return pictures.png(pictures.srgb(shade)), "image/png"
     outputs = "Y" if len(shade) == 1 else "RGB"
     attributes: dict[str, Any] = gbuffer.camera.to_header() if gbuffer.camera else {}
     attributes |= {f"deepshade:{name}": value for name, value in facts.items()}
@@ -208,20 +208,6 @@ def cut(planes: list[Plane], tile: Tile) -> Float:
             np.divide(source, np.float32(divisor), out=target[inside])
         np.clip(target, -_MOST_RADII, _MOST_RADII, out=target)
     return gbuffer
-
-
-def _png(shade: Float) -> bytes:
-    """8-bit sRGB, grey or colour (IEC 61966-2-1)."""
-    from PIL import Image
-
-    linear = np.clip(shade, 0.0, 1.0)
-    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    pixels = np.rint(255 * srgb).astype(np.uint8)
-    stream = io.BytesIO()
-    Image.fromarray(pixels[0] if len(pixels) == 1 else pixels.transpose(1, 2, 0)).save(
-        stream, "png", compress_level=1
-    )
-    return stream.getvalue()
 
 
 def _listed(entries: dict[str, str]) -> str:

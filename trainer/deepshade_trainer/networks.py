@@ -128,9 +128,7 @@ class FoldUNet(Shader):
         self.shrink = nn.ModuleList(
             nn.Conv2d(a, b, 2, stride=2) for a, b in itertools.pairwise(widths)
         )
-        self.grow = nn.ModuleList(
-            nn.Conv2d(b, a, 1) for a, b in itertools.pairwise(widths)
-        )
+        self.grow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in itertools.pairwise(widths))
         self.decode = nn.ModuleList(_blocks(width, config.depth) for width in widths[:-1])
         self.head = nn.Conv2d(widths[0], config.outputs * cells, 3, padding=1)
         nn.init.normal_(self.head.weight, std=0.01)

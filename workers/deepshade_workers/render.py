@@ -44,6 +44,7 @@ def render(
     camera and seed give the same file.
     """
     start = time.perf_counter()
+    target.parent.mkdir(parents=True, exist_ok=True)
     width, height = camera.width, camera.height
     images, hits = render_sample(
         scene,
