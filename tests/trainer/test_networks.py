@@ -70,7 +70,29 @@ def test_a_pixel_beyond_the_halo_changes_nothing(config: NetworkConfig) -> None:
     assert len(where)
     reach = int((where - middle).abs().max())
     assert reach <= halo
-    assert reach > halo // 4  # the bound isn't absurdly loose
+    assert reach > halo // 2  # the bound isn't loose; float32 hides the faintest influence
+
+
+@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, NetworkConfig(fold=4, widths=(8, 12))])
+def test_needs_are_exactly_what_gradients_reach(config: NetworkConfig) -> None:
+    """All weights 1 and no rectifier clips: every path counts, so the bound must be met."""
+    model = build(config).double().train()
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            parameter.fill_(1e-2 if name.endswith("weight") else 1.0)
+    step, halo = model.size_multiple, model.halo
+    side = 2 * step * -(-halo // step) + step
+    for offset in (0, 1, step // 2, step - 1):
+        column = side // 2 // step * step + offset
+        gbuffer = torch.rand(1, 6, step, side, dtype=torch.float64)
+        gbuffer[:, 5] -= 5
+        gbuffer.requires_grad_()
+        covered = torch.ones(1, 1, step, side, dtype=torch.float64)
+        with torch.enable_grad():
+            model.shade(gbuffer, covered)[0, 0, :, column].sum().backward()
+        assert gbuffer.grad is not None
+        columns = torch.nonzero(gbuffer.grad.abs().sum((0, 1, 2)))
+        assert (int(columns.min()), int(columns.max())) == model.needs(column)
 
 
 @pytest.mark.parametrize("config", [SMALL, SMALL_PAPER])

@@ -17,6 +17,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 
+# First and last of a run of pixels along one axis.
+Span = tuple[int, int]
+
+
 @dataclass(frozen=True)
 class NetworkConfig:
     """What a network is made of.
@@ -49,10 +53,18 @@ class Shader(nn.Module):
         """Height and width must be multiples of this many pixels."""
         raise NotImplementedError
 
+    def needs(self, pixel: int) -> Span:
+        """The input columns that the output column `pixel` depends on (rows are alike)."""
+        raise NotImplementedError
+
     @property
     def halo(self) -> int:
-        """How many pixels away an input may still change an output (an upper bound)."""
-        raise NotImplementedError
+        """How many pixels away an input may change an output, at most: exact, by construction."""
+        reach = 0
+        for pixel in range(self.size_multiple):
+            first, last = self.needs(pixel)
+            reach = max(reach, pixel - first, last - pixel)
+        return reach
 
     def shade(self, gbuffer: Tensor, covered: Tensor) -> Tensor:
         """The network itself: (N, C, H, W) and coverage (N, 1, H, W) to (N, outputs, H, W)."""
@@ -90,12 +102,19 @@ class PaperUNet(Shader):
         """One pixel of the coarsest level."""
         return int(2 ** (len(self.config.widths) - 1))
 
-    @property
-    def halo(self) -> int:
-        """Two convolutions a level, one at the coarsest, one neighbour for each upsampling."""
-        reach, levels = self.config.kernel // 2, len(self.config.widths)
-        fine = sum((2 * reach + 1) * 2**n + 2**n for n in range(levels - 1))
-        return int(fine + (reach + 1) * 2 ** (levels - 1))
+    def needs(self, pixel: int) -> Span:
+        """See `Shader.needs`."""
+        reach, last = self.config.kernel // 2, len(self.config.widths) - 1
+        skips, span = [], (pixel, pixel)
+        for _ in range(last):
+            span = _grown(span, reach)
+            skips.append(span)
+            span = _doubled(span)
+        for n in reversed(range(last + 1)):
+            span = _joined(span, skips[n]) if n < last else span
+            span = _grown(span, reach)
+            span = _folded(span, 2) if n else span
+        return span
 
     def shade(self, gbuffer: Tensor, covered: Tensor) -> Tensor:
         """See `Shader.shade`."""
@@ -140,16 +159,26 @@ class FoldUNet(Shader):
         coarsest = self.config.fold * 2 ** (len(self.config.widths) - 1)
         return math.lcm(coarsest, *self.config.windows)
 
-    @property
-    def halo(self) -> int:
-        """Convolutions and upsampling of every level, then the largest window's two blocks."""
-        reach = self.config.fold * 2  # door and head
+    def needs(self, pixel: int) -> Span:
+        """See `Shader.needs`."""
+        fold, blocks = self.config.fold, 2 * self.config.depth
         last = len(self.config.widths) - 1
-        for n in range(len(self.config.widths)):
-            scale = self.config.fold * 2**n
-            sides = 1 if n == last else 2
-            reach += scale * (2 * self.config.depth * sides + (n > 0) + 1)
-        return reach + 2 * max(self.config.windows)
+        skips, span = [], _grown((pixel // fold, pixel // fold), 1)
+        for _ in range(last):
+            span = _grown(span, blocks)
+            skips.append(span)
+            span = _doubled(span)
+        for n in reversed(range(last + 1)):
+            span = _joined(span, skips[n]) if n < last else span
+            span = _grown(span, blocks)
+            span = _folded(span, 2) if n else span
+        first, final = _folded(_grown(span, 1), fold)
+        span = first, final
+        for window in self.config.windows:  # the two nearest blocks of each pixel
+            low = (first - window // 2) // window * window
+            high = ((final - window // 2) // window + 2) * window - 1
+            span = _joined(span, (low, high))
+        return span
 
     def features(self, gbuffer: Tensor, covered: Tensor) -> Tensor:
         """(N, 5 + 4 windows, H, W): unit normal, R/z, coverage; per window offset and height."""
@@ -182,7 +211,7 @@ class FoldUNet(Shader):
             x = self.decode[n](skips[n] + _double(self.grow[n](x)))
         # bf16 has only 1/256 between 0.5 and 1, where most of an occlusion image lies.
         with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
-            return F.pixel_shuffle(self.head(x.float()), self.config.fold)
+            return F.pixel_shuffle(self.head(x.to(self.head.weight.dtype)), self.config.fold)
 
 
 class Residual(nn.Module):
@@ -199,6 +228,25 @@ class Residual(nn.Module):
         """(N, width, H, W) to the same."""
         y: Tensor = self.second(F.relu(self.first(F.relu(x))))
         return x + y
+
+
+def _grown(span: Span, reach: int) -> Span:
+    """What a convolution that reaches `reach` pixels needs."""
+    return span[0] - reach, span[1] + reach
+
+
+def _doubled(span: Span) -> Span:
+    """What bilinear x 2 needs of the coarser level: the two nearest of each pixel."""
+    return (span[0] - 1) // 2, (span[1] - 1) // 2 + 1
+
+
+def _folded(span: Span, factor: int) -> Span:
+    """What pooling or folding by `factor` needs of the finer level."""
+    return span[0] * factor, span[1] * factor + factor - 1
+
+
+def _joined(a: Span, b: Span) -> Span:
+    return min(a[0], b[0]), max(a[1], b[1])
 
 
 def _blocks(width: int, depth: int) -> nn.Sequential:
