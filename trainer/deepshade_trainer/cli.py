@@ -24,7 +24,9 @@ def train(
     device: Annotated[str, typer.Option(help="'cpu' or 'cuda'.")] = "cpu",
     threads: Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)] = 0,
 ) -> None:
-    """Train a shader. Ctrl-C saves and stops; the same command goes on. Examples:
+    """Train a shader. Ctrl-C saves and stops; the same command goes on.
+
+    Examples:
 
     deepshade train ao --data data/ao --out runs/ao
 

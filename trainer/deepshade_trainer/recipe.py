@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError
 from deepshade.files import replacing
 
@@ -97,7 +98,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def preset(name: str, effect: str) -> Recipe:
-    """The recipe of a preset for an effect; raises ConfigError for an unknown preset."""
+    """The recipe of a preset for an effect; raises ConfigError if either is unknown."""
+    if effect not in EFFECTS:
+        raise ConfigError(effect, EFFECTS, detail=f"no effect {effect!r}: {', '.join(EFFECTS)}")
     if name not in PRESETS:
         raise ConfigError(name, PRESETS, detail=f"no preset {name!r}: {', '.join(PRESETS)}")
     return Recipe(effect=effect).changed(**PRESETS[name])
