@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-
 # First and last of a run of pixels along one axis.
 Span = tuple[int, int]
 
