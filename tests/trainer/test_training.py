@@ -93,6 +93,7 @@ def test_another_recipe_does_not_resume(data: Path, tmp_path: Path, recipe: Reci
     # More steps are the same run, longer.
     longer = list(train(recipe.changed(steps=8), [data], Run(tmp_path)))
     assert [p.step for p in longer] == [7, 8]
+    assert Recipe.read(Run(tmp_path).recipe).steps == 8
 
 
 def test_a_damaged_checkpoint_is_said(data: Path, tmp_path: Path, recipe: Recipe) -> None:

@@ -102,6 +102,7 @@ class _Trainer:
                 detail=f"{self.run.folder} was begun with another recipe; give the same one, or "
                 "another --out",
             )
+        self.recipe.write(self.run.recipe)  # the number of steps may be another
         groups, step, optimizer = self.run.load()
         self.model.load_state_dict(groups["model"])
         self.average = {k: v.to(self.device) for k, v in groups["average"].items()}
