@@ -2,6 +2,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# A half-made environment (no python3-venv) has a python but no pip: begin anew.
+MAKE_VENV = test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || \
+	{ echo 'no virtual environments here; run: sudo apt-get install -y python3-venv' >&2; exit 1; }
 PIP := $(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt
 
 .DEFAULT_GOAL := help
@@ -13,13 +16,13 @@ help: ## List the targets
 # Each stamp is one set of packages; a changed pyproject or constraints file installs anew.
 $(VENV)/stamp-serve: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "deepshade needs Python 3.11 or newer")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(MAKE_VENV)
 	$(PIP) -e '.[client,service]'
 	touch $@
 
 $(VENV)/stamp-all: pyproject.toml constraints.txt scripts/libllvm.sh
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "deepshade needs Python 3.11 or newer")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(MAKE_VENV)
 	$(PIP) -e '.[all,dev]'
 	touch $(VENV)/stamp-serve $@
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepshade.bundles import Bundle, find_bundles
+from deepshade.bundles import Bundle, bundle_folders
 from deepshade.cli import main
 
 SETTINGS = ["steps=4", "batch=4", "network.widths=[8,12]", "network.windows=[4,16]"]
@@ -28,7 +28,7 @@ def test_train_export_evaluate(
     note.write_text("Made by a test.")
     out = ["--out", str(bundle), "--data", str(data), "--test", str(data), "--note", str(note)]
     assert main(["export", str(run), *out]) == 0
-    assert [b.name for b in find_bundles(tmp_path / "models")] == ["mine"]
+    assert [b.name for b in bundle_folders(tmp_path / "models")] == ["mine"]
     card = (bundle / "README.md").read_text()
     assert "Made by a test." in card
     assert "16-bit positions" in card

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from deepshade import symmetry
 from deepshade.errors import DataError
-from deepshade_trainer.dataset import Dataset, batches
+from deepshade_trainer.dataset import Dataset, batches, rounded
 
 from .conftest import sample
 
@@ -36,6 +37,19 @@ def test_no_scene_is_on_both_sides_of_the_split(data: Path) -> None:
     scenes = [{found.entries[k].record["scene"] for k in side} for side in (training, held)]
     assert not scenes[0] & scenes[1]
     assert found.split(0.3) == (training, held)
+
+
+def test_at_least_one_scene_is_held_out(data: Path) -> None:
+    training, held = Dataset([data], "ao").split(1e-9)
+    assert len(held) == 2  # the two samples of one scene
+    assert len(training) == 22
+    assert Dataset([data], "ao").split(0.0)[1] == []
+
+
+def test_sixteen_bits_are_left_out_where_they_overflow() -> None:
+    small, large = np.float32([0.1, 6e4]), np.float32([0.1, 7e4])
+    assert (rounded(small) != small).any()
+    assert (rounded(large) == large).all()
 
 
 def test_a_step_sees_the_same_batch_whenever_it_is_read(data: Path) -> None:
@@ -90,8 +104,13 @@ def test_what_is_wrong_is_said(data: Path, tmp_path: Path) -> None:
     for shard in document["shards"]:
         (tmp_path / shard["file"]).write_bytes(b"not a shard")
     broken = Dataset([tmp_path], "ao")
-    with pytest.raises(DataError, match="can't be read"):
+    with pytest.raises(DataError, match="not the file that the manifest describes"):
         broken.load(0)
+    for shard in document["shards"]:
+        shard["sha256"] = hashlib.sha256(b"not a shard").hexdigest()
+    (tmp_path / "manifest.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match="can't be read"):
+        Dataset([tmp_path], "ao").load(0)
     document["shards"][0]["file"] = "../elsewhere"
     (tmp_path / "manifest.json").write_text(json.dumps(document))
     with pytest.raises(DataError, match="not in its folder"):

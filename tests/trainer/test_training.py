@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -121,6 +122,41 @@ def test_presets_and_settings() -> None:
         paper.changed(network={"width": 3})
     with pytest.raises(ConfigError):
         preset("papr", "ao")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"precision": "fp16"},
+        {"schedule": "lineer"},
+        {"steps": "abc"},
+        {"steps": 0},
+        {"loss": "l9"},
+        {"held_out": 1.5},
+        {"network": {"kind": "foo"}},
+        {"network": {"widths": 8}},
+        {"network": {"widths": [8, -1]}},
+    ],
+)
+def test_settings_that_no_run_could_mean(change: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        preset("default", "ao").changed(**change)
+
+
+@pytest.mark.parametrize(
+    ("effect", "inputs", "outputs"),
+    [("ao", 6, 1), ("dof", 2, 1), ("gi", 7, 1), ("do", 9, 3), ("mb", 4, 1)],
+)
+def test_every_effect_has_its_networks_inputs(effect: str, inputs: int, outputs: int) -> None:
+    network = preset("paper", effect).network
+    assert (network.inputs, network.outputs) == (inputs, outputs)
+
+
+def test_a_broken_held_out_sample_is_named_not_averaged(tmp_path: Path, recipe: Recipe) -> None:
+    data = write_data(tmp_path / "data", broken=tuple(range(24)))
+    warning = next(iter(train(recipe, [data], Run(tmp_path / "run")))).warning
+    assert "not validated on: shard-0000" in warning
+    assert "nothing to validate on" in warning
 
 
 def test_a_recipe_survives_saving(tmp_path: Path, recipe: Recipe) -> None:

@@ -109,7 +109,8 @@ def test_scene_names_expand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"views": 0}, {"seed": -1}, {"frame": 8}, {"scenes": ()}, {"shard_size": 0}]
+    "change",
+    [{"views": 0}, {"seed": -1}, {"frame": 8}, {"scenes": ()}, {"shard_size": 0}, {"radius": -1.0}],
 )
 def test_impossible_jobs_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
@@ -146,7 +147,7 @@ def running(arguments: list[str], **options: Any) -> Iterator[subprocess.Popen[b
         process.wait()
 
 
-def workers_of(parent: int) -> list[int]:
+def workers_of(parent: int, name: str = "ray::_shard_task") -> list[int]:
     """Ray's task processes that descend from process `parent`."""
     listing = subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True)
     rows = [line.split(None, 2) for line in listing.stdout.splitlines()[1:]]
@@ -156,7 +157,7 @@ def workers_of(parent: int) -> list[int]:
         ancestor = int(pid)
         while ancestor in above and ancestor != parent:
             ancestor = above[ancestor]
-        if ancestor == parent and args.startswith("ray::_shard_task"):
+        if ancestor == parent and args.startswith(name):
             found.append(int(pid))
     return found
 
@@ -176,6 +177,8 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, expected: dict[s
     with running([str(DEEPSHADE), "datagen", *command(tmp_path)]) as process:
         victims = wait_for(lambda: workers_of(process.pid))
         os.kill(victims[0], signal.SIGKILL)
+        counter = wait_for(lambda: workers_of(process.pid, "ray::Tally"))
+        os.kill(counter[0], signal.SIGKILL)
         assert process.wait(200) == 0
     check(tmp_path, expected)
 
@@ -185,16 +188,16 @@ def test_a_killed_job_goes_on(tmp_path: Path, expected: dict[str, str]) -> None:
     with running([str(DEEPSHADE), "datagen", *command(tmp_path)]) as process:
         wait_for(lambda: list(tmp_path.glob("shard-*")))
         os.killpg(process.pid, signal.SIGKILL)
-    # What a kill in the middle of a write would leave:
+    # What a kill in the middle of a write leaves, and a shard that was damaged later:
+    (tmp_path / ".shard-00003.safetensors.0badcafe.tmp").write_bytes(b"half")
+    complete = next(iter(sorted(tmp_path.glob("shard-*"))))
+    complete.write_bytes(complete.read_bytes()[:-8])
     done = subprocess.run(
         [str(DEEPSHADE), "datagen", *command(tmp_path)], capture_output=True, timeout=200
     )
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout)
     assert summary["views"] == 12
-    leftovers = [p for p in tmp_path.iterdir() if p.name.startswith(".")]
-    for path in leftovers:  # readers ignore them: the manifest is what counts
-        path.unlink()
     check(tmp_path, expected)
 
 

@@ -58,6 +58,29 @@ def test_sharp_edges_stay_sharp(tmp_path: Path) -> None:
     assert np.allclose(np.abs(normals).max(2), 1)
 
 
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb"])
+def test_normals_of_the_file_are_kept(tmp_path: Path, suffix: str) -> None:
+    """Normals tilted on purpose come back tilted, turned along with the node."""
+    tilted = np.tile([0.6, 0.0, 0.8], (3, 1))
+    sheet = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], vertex_normals=tilted, process=False
+    )
+    scene = trimesh.Scene()
+    turn = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1.0]])
+    scene.add_geometry(sheet, transform=turn)
+    path = tmp_path / f"tilted.{suffix}"
+    if suffix == "glb":
+        scene.export(path, include_normals=True)
+        expected = turn[:3, :3] @ tilted[0]
+    elif suffix == "obj":
+        sheet.export(path, include_normals=True)
+        expected = tilted[0]
+    else:
+        sheet.export(path, vertex_normal=True)
+        expected = tilted[0]
+    assert np.allclose(load_mesh(path).normals, expected, atol=1e-5)
+
+
 def test_polygons_of_an_obj_are_triangulated(tmp_path: Path) -> None:
     (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
     assert len(load_mesh(tmp_path / "quad.obj").faces) == 2

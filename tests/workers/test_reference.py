@@ -10,7 +10,7 @@ import pytest
 from deepshade.camera import Camera
 from deepshade_workers.mesh import merge
 from deepshade_workers.procedural.primitives import box, place
-from deepshade_workers.reference import ambient_occlusion, strata
+from deepshade_workers.reference import ambient_occlusion, rays_used, strata
 from deepshade_workers.scene import Scene
 from deepshade_workers.trace import trace
 
@@ -122,7 +122,9 @@ def test_the_same_seed_gives_the_same_image(corner: Any, down: Camera) -> None:
 
 
 @pytest.mark.parametrize(
-    ("samples", "grid"), [(2, (1, 1)), (256, (16, 8)), (64, (8, 4)), (14, (7, 1))]
+    ("samples", "grid"),
+    [(2, (1, 1)), (256, (16, 8)), (64, (8, 4)), (14, (3, 2)), (254, (11, 11)), (6, (3, 1))],
 )
 def test_strata_hold_two_samples_each(samples: int, grid: tuple[int, int]) -> None:
     assert strata(samples) == grid
+    assert rays_used(samples) == 2 * grid[0] * grid[1] <= samples

@@ -150,15 +150,21 @@ def export(
 
     deepshade export runs/ao --out models/ao/balanced --data data/ao --test data/test
     """
+    from deepshade.errors import ConfigError
+
     from .card import measure, write_card
     from .export import export as write
     from .run import Run
 
+    try:
+        ending = note.read_text() if note else ""
+    except OSError as error:
+        raise ConfigError("note", detail=f"can't read {note}: {error.strerror}") from error
     bundle, worst = write(Run(run), out, data, radius=radius)
     if test:
         bundle = measure(bundle, test)
-    write_card(bundle, Run(run), note.read_text() if note else "")
-    typer.echo(f"{out}: sha256 {bundle.sha256}, ONNX Runtime within {worst:.1e} of torch")
+    write_card(bundle, Run(run), ending)
+    typer.echo(f"{out}: sha256 {bundle.short_hash}, ONNX Runtime within {worst:.1e} of torch")
 
 
 def _parse(settings: list[str]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
+from hashlib import sha256 as digest_of
 from pathlib import Path
 from queue import Queue
 from threading import Event, Thread
@@ -19,7 +19,7 @@ from torch import Tensor
 from deepshade import symmetry
 from deepshade.effects import EFFECTS
 from deepshade.errors import DataError
-from deepshade.manifest import Manifest, shard_path
+from deepshade.manifest import Manifest, sha256, shard_path
 
 Sample = dict[str, NDArray[np.float32]]
 
@@ -32,6 +32,7 @@ class Entry:
     """Where a sample lies, and what it was rendered from."""
 
     path: Path
+    digest: str
     index: int
     record: dict[str, Any]
 
@@ -65,11 +66,20 @@ class Dataset:
                 path = shard_path(folder, shard)
                 if not path.is_file():
                     raise DataError(f"{path} is named by the manifest but missing")
-                self.entries += [Entry(path, k, r) for k, r in enumerate(shard.samples)]
+                self.entries += [
+                    Entry(path, shard.sha256, k, r) for k, r in enumerate(shard.samples)
+                ]
 
     def split(self, share: float, *, seed: int = 0) -> tuple[list[int], list[int]]:
-        """Sample numbers to train on and to validate on; no scene is in both."""
-        held = [_unit(f"{seed}:{entry.record['scene']}") < share for entry in self.entries]
+        """Sample numbers to train on and to validate on; no scene is in both.
+
+        Scenes are held out by a hash of their name, so more data doesn't move them; with a
+        `share` above 0 at least one is, where there are two.
+        """
+        hashes = [_unit(f"{seed}:{entry.record['scene']}") for entry in self.entries]
+        if share > 0 and len(set(hashes)) > 1:
+            share = max(share, float(np.nextafter(min(hashes), 1)))
+        held = [value < share for value in hashes]
         training = [k for k, out in enumerate(held) if not out]
         return training, [k for k, out in enumerate(held) if out]
 
@@ -77,6 +87,11 @@ class Dataset:
         """Sample `number`: planar float32 inputs in physical units, and its reference."""
         entry = self.entries[number]
         if entry.path not in self._open:
+            if sha256(entry.path) != entry.digest:
+                raise DataError(
+                    f"{entry.path} is not the file that the manifest describes",
+                    fix="run the same 'deepshade datagen' again: it renders what is damaged",
+                )
             try:
                 self._open[entry.path] = safe_open(entry.path, framework="numpy")
             except Exception as error:  # safetensors' own error type says only "invalid header"
@@ -112,10 +127,17 @@ class Dataset:
                 for name, plane in sample.items()
             }
             if half and "position" in turned:
-                turned["position"] = turned["position"].astype(np.float16).astype(np.float32)
+                turned["position"] = rounded(turned["position"])
             inputs.append(self.gbuffer(turned, float(self.entries[number].record["radius"])))
             references.append(turned[self.reference])
         return torch.from_numpy(np.stack(inputs)), torch.from_numpy(np.stack(references))
+
+
+def rounded(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """`plane` as 16 bits hold it; unchanged where they can't (beyond 65504)."""
+    if np.abs(plane).max() > np.finfo(np.float16).max:
+        return plane
+    return plane.astype(np.float16).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -189,4 +211,4 @@ def _permutation(count: int, seed: int, epoch: int) -> NDArray[np.int64]:
 
 def _unit(text: str) -> float:
     """A hash of `text` in [0, 1)."""
-    return int.from_bytes(sha256(text.encode()).digest()[:8], "little") / 2.0**64
+    return int.from_bytes(digest_of(text.encode()).digest()[:8], "little") / 2.0**64

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from deepshade import metrics, pictures
 from deepshade.bundles import Bundle
-from deepshade.errors import DataError
+from deepshade.errors import ConfigError, DataError
 
-from .dataset import Dataset, Sample
+from .dataset import Dataset, Sample, rounded
 
 Image = NDArray[np.float32]
 FIGURES = ("ssim", "dssim", "psnr", "mae", "flip", "trivial_ssim", "trivial_dssim")
@@ -42,7 +42,7 @@ class Variant:
             lengths = np.random.default_rng(0).uniform(1 - self.stretch, 1, shape)
             changed["normal"] = changed["normal"] * lengths.astype(np.float32)
         for name in self.half:
-            changed[name] = changed[name].astype(np.float16).astype(np.float32)
+            changed[name] = rounded(changed[name])
         return changed, radius * self.scale
 
 
@@ -92,6 +92,9 @@ def evaluate(
     """
     data, shader = Dataset(folders, bundle.effect), Shaded(bundle)
     variant = variant or Variant()
+    for name in variant.half:
+        if name not in bundle.inputs:
+            raise ConfigError(name, bundle.inputs, detail=f"{bundle.effect} has no input {name!r}")
     found = 0
     for number, entry in enumerate(data.entries):
         sample = data.load(number)

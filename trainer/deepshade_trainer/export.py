@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
+from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import MODEL, WEIGHTS, Bundle, write_config
 from deepshade.effects import EFFECTS
 from deepshade.errors import DataError
+from deepshade.files import replacing
 
 from .dataset import Dataset
 from .networks import Shader, build
@@ -68,10 +70,9 @@ def export(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").unlink(missing_ok=True)  # no bundle while its files change
     write_onnx(model, folder / MODEL)
-    save_file(
-        {name: tensor.contiguous() for name, tensor in model.state_dict().items()},
-        folder / WEIGHTS,
-    )
+    with replacing(folder / WEIGHTS) as temporary:
+        tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
+        temporary.write_bytes(save(tensors))
     samples = Dataset(data, recipe.effect)
     chosen = np.linspace(0, len(samples.entries) - 1, PARITY_SAMPLES).astype(int)
     gbuffers = [samples.batch([int(number)])[0] for number in chosen]
@@ -81,9 +82,10 @@ def export(
     planes = torch.cat(gbuffers)
     ranges, start = {}, 0
     for name in effect.inputs:
-        block = planes[:, start : start + 3]
+        count = len(ATTRIBUTES[name].channels)
+        block = planes[:, start : start + count]
         ranges[name] = (float(block.min()), float(block.max()))
-        start += 3
+        start += count
     bundle = write_config(
         folder,
         effect=recipe.effect,
@@ -108,9 +110,8 @@ def write_onnx(model: Shader, path: Path) -> None:
 
     side = 2 * model.size_multiple
     example = torch.zeros(1, model.config.inputs, side, side)
-    temporary = path.with_suffix(".tmp.onnx")
     free = {0: "batch", 2: "height", 3: "width"}
-    try:
+    with replacing(path) as temporary:
         with _quiet(), torch.inference_mode():
             torch.onnx.export(
                 model,
@@ -124,9 +125,6 @@ def write_onnx(model: Shader, path: Path) -> None:
             )
         graph = onnx.load(str(temporary))
         onnx.checker.check_model(graph, full_check=True)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def parity(model: Shader, path: Path, gbuffers: Sequence[Tensor]) -> float:

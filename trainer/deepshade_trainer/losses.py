@@ -29,8 +29,8 @@ def l2(image: Tensor, reference: Tensor) -> Tensor:
 def dssim(image: Tensor, reference: Tensor) -> Tensor:
     """(1 - SSIM) / 2 with uniform 8 x 8 windows at stride 1 (paper, section 4.3); in [0, 1].
 
-    Images smaller than a window are one window. Each window's mean is taken out before its
-    variance: values are first made relative to the reference's mean, so that little cancels.
+    Images smaller than a window are one window. Values are first made relative to the
+    reference's mean, so that little cancels in a window's E[x²] - E[x]².
     """
     window = [min(WINDOW, side) for side in image.shape[-2:]]
 

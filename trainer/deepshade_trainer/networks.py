@@ -27,6 +27,7 @@ class NetworkConfig:
     `kind` is "paper" or "fold". `widths` are the channels of each level, finest first; `fold`
     pixels along each side become channels at the door; `windows` are the sizes (pixels) of the
     blocks whose mean position each pixel is seen from; `depth` residual blocks a level and side.
+    `normal` and `position` are the first of their three input channels, None without them.
     """
 
     kind: str = "fold"
@@ -37,6 +38,8 @@ class NetworkConfig:
     windows: tuple[int, ...] = (4, 16, 64)
     depth: int = 1
     kernel: int = 3
+    normal: int | None = 0
+    position: int | None = 3
 
 
 class Shader(nn.Module):
@@ -71,8 +74,10 @@ class Shader(nn.Module):
 
     def forward(self, gbuffer: Tensor) -> Tensor:
         """Shade (N, C, H, W); unbounded while training, [0, 1] in evaluation mode."""
-        # A background pixel has no normal: its first three channels are zero.
-        covered = (gbuffer[:, :3].square().sum(1, keepdim=True) > 1e-12).to(gbuffer.dtype)
+        # A background pixel has no normal; where there are no normals, it has nothing at all.
+        start = self.config.normal
+        told = gbuffer if start is None else gbuffer[:, start : start + 3]
+        covered = (told.square().sum(1, keepdim=True) > 1e-12).to(gbuffer.dtype)
         image = self.shade(gbuffer, covered).float()
         if not self.training:
             image = image.clamp(0, 1)
@@ -140,7 +145,15 @@ class FoldUNet(Shader):
     def __init__(self, config: NetworkConfig, background: float) -> None:
         super().__init__(config, background)
         widths, cells = config.widths, config.fold**2
-        features = 5 + 4 * len(config.windows)
+        if config.normal is None or config.position is None:
+            raise ValueError("the folded network needs normals and positions")
+        self.other = [
+            k
+            for k in range(config.inputs)
+            if not config.normal <= k < config.normal + 3
+            and not config.position <= k < config.position + 3
+        ]
+        features = 5 + 4 * len(config.windows) + len(self.other)
         self.door = nn.Conv2d(features * cells, widths[0], 3, padding=1)
         self.encode = nn.ModuleList(_blocks(width, config.depth) for width in widths)
         self.shrink = nn.ModuleList(
@@ -180,8 +193,12 @@ class FoldUNet(Shader):
         return span
 
     def features(self, gbuffer: Tensor, covered: Tensor) -> Tensor:
-        """(N, 5 + 4 windows, H, W): unit normal, R/z, coverage; per window offset and height."""
-        normal, position = gbuffer[:, :3], gbuffer[:, 3:6]
+        """(N, 5 + 4 windows + other inputs, H, W) for a G-buffer (N, inputs, H, W).
+
+        Unit normal, R/z, coverage; per window offset and height; what else there is as it is.
+        """
+        start, place = self.config.normal or 0, self.config.position or 0
+        normal, position = gbuffer[:, start : start + 3], gbuffer[:, place : place + 3]
         length = normal.square().sum(1, keepdim=True)
         normal = normal * torch.rsqrt(length.clamp_min(1e-12))
         nearness = covered / (-position[:, 2:3]).clamp_min(0.25)
@@ -195,6 +212,8 @@ class FoldUNet(Shader):
             offset = F.softsign(offset * (8.0 / window**0.5)) * covered
             height = (offset * normal).sum(1, keepdim=True)
             found += [offset, height]
+        if self.other:
+            found.append(gbuffer[:, self.other])
         return torch.cat(found, 1)
 
     def shade(self, gbuffer: Tensor, covered: Tensor) -> Tensor:

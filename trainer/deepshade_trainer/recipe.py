@@ -8,11 +8,36 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError
 from deepshade.files import replacing
 
-from .networks import NetworkConfig
+from .losses import parse_loss
+from .networks import KINDS, NetworkConfig
+
+CHOICES = {
+    "effect": tuple(EFFECTS),
+    "optimizer": ("adamw", "adadelta"),
+    "schedule": ("cosine", "constant"),
+    "precision": ("bf16", "fp32"),
+}
+
+
+def check_types(settings: Any) -> None:
+    """Raise ConfigError for a field of a settings dataclass that isn't of its default's type."""
+    for field_ in dataclasses.fields(settings):
+        default, value = field_.default, getattr(settings, field_.name)
+        if default is dataclasses.MISSING or (value is None and "None" in str(field_.type)):
+            continue
+        wanted = (int, float) if isinstance(default, float) else type(default)
+        good = isinstance(value, wanted) and not isinstance(value, bool)
+        if isinstance(value, tuple):
+            good = good and len(value) > 0 and all(type(v) is int and v > 0 for v in value)
+        if not good:
+            raise ConfigError(
+                field_.name, detail=f"{field_.name} can't be {value!r}, it is like {default!r}"
+            )
 
 
 @dataclass(frozen=True)
@@ -40,6 +65,23 @@ class Recipe:
     seed: int = 0
     held_out: float = 0.04
 
+    def __post_init__(self) -> None:
+        """Raise ConfigError for a value that no run could mean."""
+        check_types(self)
+        for key, choices in CHOICES.items():
+            if getattr(self, key) not in choices:
+                raise ConfigError(
+                    str(getattr(self, key)),
+                    choices,
+                    detail=f"{key} must be one of {', '.join(choices)}, not {getattr(self, key)!r}",
+                )
+        parse_loss(self.loss)
+        for key in ("batch", "steps"):
+            if getattr(self, key) < 1:
+                raise ConfigError(key, detail=f"{key} must be at least 1, not {getattr(self, key)}")
+        if not 0 <= self.held_out < 1:
+            raise ConfigError("held_out", detail=f"held_out must be in [0, 1), not {self.held_out}")
+
     def changed(self, **changes: Any) -> Recipe:
         """A copy with some settings replaced; `network` takes a dict of its own.
 
@@ -59,6 +101,13 @@ class Recipe:
                 k: tuple(v) if isinstance(v, list) else v for k, v in network.items()
             }
             changes["network"] = dataclasses.replace(self.network, **lists)
+            check_types(changes["network"])
+            if changes["network"].kind not in KINDS:
+                raise ConfigError(
+                    str(changes["network"].kind),
+                    KINDS,
+                    detail=f"no network {changes['network'].kind!r}: {', '.join(KINDS)}",
+                )
         return dataclasses.replace(self, **changes)
 
     def write(self, path: Path) -> None:
@@ -103,4 +152,21 @@ def preset(name: str, effect: str) -> Recipe:
         raise ConfigError(effect, EFFECTS, detail=f"no effect {effect!r}: {', '.join(EFFECTS)}")
     if name not in PRESETS:
         raise ConfigError(name, PRESETS, detail=f"no preset {name!r}: {', '.join(PRESETS)}")
-    return Recipe(effect=effect).changed(**PRESETS[name])
+    return Recipe(effect, NetworkConfig(**channels_of(effect))).changed(**PRESETS[name])
+
+
+def channels_of(effect: str) -> dict[str, Any]:
+    """A network's inputs and outputs for `effect`, and where normals and positions lie in it.
+
+    Effects "per channel" run once for each colour channel, so a colour counts as one.
+    """
+    row = EFFECTS[effect]
+    found: dict[str, Any] = {"normal": None, "position": None}
+    start = 0
+    for name in row.inputs:
+        if name in found:
+            found[name] = start
+        attribute = ATTRIBUTES[name]
+        one = row.per_channel and attribute.kind == "colour"
+        start += 1 if one else len(attribute.channels)
+    return {**found, "inputs": start, "outputs": 1 if row.per_channel else len(row.outputs)}

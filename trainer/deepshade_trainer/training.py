@@ -71,6 +71,7 @@ class _Trainer:
                 f"{len(self.training)} samples don't fill a batch of {recipe.batch}",
                 fix="render more views, or train with a smaller --set batch=",
             )
+        self.warnings: list[str] = []
         self.held = self._telling(held)
         torch.manual_seed(recipe.seed)
         background = EFFECTS[recipe.effect].background
@@ -82,13 +83,21 @@ class _Trainer:
         self.first = self._resume()
 
     def _telling(self, held: list[int]) -> list[int]:
-        """Up to `VALIDATION_SAMPLES` held-out samples that have something to show."""
+        """Up to `VALIDATION_SAMPLES` sound held-out samples that have something to show."""
         least = MIN_CONTRAST.get(self.recipe.effect, 0.0)
         step = max(1, len(held) // (2 * VALIDATION_SAMPLES))
         found = []
         for number in held[::step]:
-            if float(self.data.load(number)[self.data.reference].std()) >= least:
+            sample = self.data.load(number)
+            if not all(np.isfinite(plane).all() for plane in sample.values()):
+                self.warnings.append(f"not validated on: {self.data.entries[number].name}")
+            elif float(sample[self.data.reference].std()) >= least:
                 found.append(number)
+        if not found and self.recipe.held_out:
+            self.warnings.append(
+                f"nothing to validate on: none of {len(held)} held-out samples is sound and has "
+                f"a contrast of {least}"
+            )
         return found[:VALIDATION_SAMPLES]
 
     def _resume(self) -> int:
@@ -127,14 +136,17 @@ class _Trainer:
             for batch in source:
                 step = batch.step + 1
                 value, problem = self._learn(batch)
-                warning, figures = "", None
+                figures = None
                 if problem:
                     bad += 1
                     names = ", ".join(self.data.entries[n].name for n in batch.numbers)
-                    warning = f"step {step}: {problem}; skipped {names}"
-                    if bad > MAX_BAD_BATCHES:
-                        raise DataError(f"more than {MAX_BAD_BATCHES} useless batches: {warning}")
+                    self.warnings.append(f"step {step}: {problem}; skipped {names}")
+                    if bad >= MAX_BAD_BATCHES:
+                        raise DataError(
+                            f"{bad} useless batches in a row, the last at {self.warnings[-1]}"
+                        )
                 else:
+                    bad = 0
                     smooth = value if math.isnan(smooth) else 0.98 * smooth + 0.02 * value
                     log.add_scalar("loss/train", value, step)
                 last = step == recipe.steps or stopped()
@@ -142,6 +154,8 @@ class _Trainer:
                     figures = self._validate(log, step)
                 if step % SAVE_EVERY == 0 or last:
                     self._save(step)
+                warning = "; ".join(self.warnings)
+                self.warnings.clear()
                 yield Progress(step, recipe.steps, smooth, figures, warning)
                 if last:
                     break
@@ -212,7 +226,9 @@ class _Trainer:
         history = json.loads(self.run.metrics.read_text()) if self.run.metrics.exists() else []
         history = [entry for entry in history if entry["step"] < step]
         with replacing(self.run.metrics) as temporary:
-            temporary.write_text(json.dumps([*history, {"step": step, **figures}], indent=1))
+            temporary.write_text(
+                json.dumps([*history, {"step": step, **figures}], indent=1, allow_nan=False)
+            )
         return figures
 
     def _save(self, step: int) -> None:

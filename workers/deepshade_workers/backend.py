@@ -7,7 +7,7 @@ import os
 from typing import Any
 
 from deepshade.errors import DeepshadeError
-from deepshade.llvm import find_libllvm
+from deepshade.llvm import FIX, find_libllvm
 
 VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
 
@@ -29,7 +29,7 @@ def mitsuba(variant: str | None = None) -> Any:
     if variant == "llvm_ad_rgb" and library is None:
         raise DeepshadeError(
             "Mitsuba's llvm_ad_rgb variant needs libLLVM 17 or newer, and none was found",
-            fix="apt-get install libllvm19, or set DRJIT_LIBLLVM_PATH to a libLLVM shared library",
+            fix=FIX,
         )
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from deepshade.errors import ConfigError, DataError, SceneError
+from deepshade.files import sha256
 from deepshade.manifest import NAME, Manifest, Shard
 
 from .loading import PROCEDURAL, SUFFIXES, parse_procedural
@@ -35,7 +38,7 @@ class Job:
     views: int
     effects: tuple[str, ...] = ("ao",)
     size: int = 256
-    frame: int = 512
+    frame: int = 256
     spp: int = 256
     seed: int = 0
     radius: float | None = None
@@ -52,6 +55,8 @@ class Job:
             )
         if self.seed < 0:
             raise ConfigError("seed", detail=f"the seed must be 0 or more, not {self.seed}")
+        if self.radius is not None and not (math.isfinite(self.radius) and self.radius > 0):
+            raise ConfigError("radius", detail=f"the radius must be above 0, not {self.radius}")
         if not self.scenes:
             raise ConfigError("scenes", detail="no scenes were given: --scenes procedural, say")
 
@@ -194,8 +199,8 @@ def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[
     """Render what is missing of `job` into `folder` on a Ray cluster.
 
     `address` is a running cluster's; None takes RAY_ADDRESS, or else starts a cluster in this
-    process. All nodes must see `folder` under the same path. Yields (samples done, samples in
-    all) a few times a second. A killed worker's shard is rendered anew by another.
+    process. All nodes must see `folder` and the scenes under the same paths. Yields (samples
+    done, samples in all) a few times a second. A killed worker's shard is rendered anew by another.
 
     Raises:
         DataError: the folder holds another data set.
@@ -206,6 +211,8 @@ def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[
     folder = folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     manifest = open_manifest(job, folder)
+    for leftover in folder.glob(".*.tmp"):  # of a job killed while it wrote
+        leftover.unlink(missing_ok=True)
     missing = [k for k in range(job.shards) if not _complete(job, k, manifest, folder)]
     ready = job.views - sum(len(job.samples(k)) for k in missing)
     yield ready, job.views
@@ -213,23 +220,26 @@ def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[
         return
     _connect(address)
     try:
-        tally: Any = ray.remote(num_cpus=0)(Tally)
+        tally: Any = ray.remote(num_cpus=0, max_restarts=-1, max_task_retries=-1)(Tally)
         tally = tally.remote()
         task = ray.remote(num_cpus=1, max_retries=5)(_shard_task)
         # A few at a time: a kill then loses little, and the cluster's memory stays flat.
         slots = max(1, 2 * int(_resources().get("CPU", 1)))
         running: list[Any] = []
+        counted = ready
         waiting = iter(missing)
         while True:
             for k in itertools.islice(waiting, slots - len(running)):
-                running.append(task.remote(job, k, str(folder), tally))
+                running.append(task.remote(job, k, str(folder), str(Path.cwd()), tally))
             if not running:
                 break
             finished, running = ray.wait(running, num_returns=1, timeout=0.5)
             for reference in finished:
                 manifest = manifest.with_shard(_result(reference))
                 manifest.write(folder)
-            yield min(ready + ray.get(tally.total.remote()), job.views), job.views
+            with suppress(ray.exceptions.RayActorError):  # restarting; counts come back
+                counted = max(counted, ready + ray.get(tally.total.remote()))
+            yield min(counted, job.views), job.views
         yield job.views, job.views
     finally:
         ray.shutdown()
@@ -239,7 +249,8 @@ def _complete(job: Job, index: int, manifest: Manifest, folder: Path) -> bool:
     return any(
         shard.file == shard_name(index)
         and len(shard.samples) == len(job.samples(index))
-        and (folder / shard.file).exists()
+        and (folder / shard.file).is_file()
+        and sha256(folder / shard.file) == shard.sha256
         for shard in manifest.shards
     )
 
@@ -259,11 +270,12 @@ class Tally:
         return sum(self.counts.values())
 
 
-def _shard_task(job: Job, index: int, folder: str, tally: Any) -> Shard:
+def _shard_task(job: Job, index: int, folder: str, home: str, tally: Any) -> Shard:
     import drjit as dr
 
     from .backend import mitsuba
 
+    os.chdir(home)  # scenes may have relative names
     mitsuba()
     dr.set_thread_count(1)  # Ray gave this task one core
     count = 0

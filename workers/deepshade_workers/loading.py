@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deepshade.errors import SceneError
+from deepshade.errors import SceneError, nearest
 
 from .mesh import Material, Mesh, merge
 from .procedural import FAMILIES, generate
@@ -42,8 +41,8 @@ def parse_procedural(name: str) -> tuple[str, int | None]:
     """Split `procedural:<family>[:<seed>]`; raises SceneError for an unknown family."""
     _, family, *rest = [*name.split(":"), ""][:3] if ":" in name else ["", "", ""]
     if family not in FAMILIES:
-        near = difflib.get_close_matches(family, FAMILIES, 1)
-        hint = f"did you mean {near[0]}? " if near else ""
+        near = nearest(family, FAMILIES)
+        hint = f"did you mean {near}? " if near else ""
         raise SceneError(
             f"no procedural family {family!r}", fix=f"{hint}there are {', '.join(FAMILIES)}"
         )
@@ -70,15 +69,28 @@ def load_mesh(path: Path) -> Mesh:
         )
     try:
         loaded = trimesh.load_scene(path, process=False)
-        parts = [
-            part for part in loaded.dump(concatenate=False) if isinstance(part, trimesh.Trimesh)
-        ]
+        meshes = [mesh for node in loaded.graph.nodes_geometry for mesh in _placed(loaded, node)]
     except Exception as error:  # trimesh raises whatever its many parsers do
         raise SceneError(f"{path} can't be read: {error}") from error
-    meshes = [_convert(part) for part in parts if len(part.faces)]
-    if not meshes or not any(len(mesh.faces) for mesh in meshes):
+    if not any(len(mesh.faces) for mesh in meshes):
         raise SceneError(f"{path} holds no triangles")
     return merge(meshes)
+
+
+def _placed(scene: Any, node: str) -> list[Mesh]:
+    """The mesh of a scene graph's node, if it has one, where its transforms put it.
+
+    trimesh can do this itself (`dump`), but then forgets the normals that the file brought.
+    """
+    import trimesh
+
+    matrix, name = scene.graph[node]
+    part = scene.geometry[name]
+    if not isinstance(part, trimesh.Trimesh) or not len(part.faces):
+        return []
+    if abs(np.linalg.det(matrix[:3, :3])) == 0:
+        return []  # squashed flat: some exporters hide things so
+    return [_convert(part).transformed(np.asarray(matrix, np.float64))]
 
 
 def _convert(part: Any) -> Mesh:

@@ -8,6 +8,7 @@ via the Tiny Encryption Algorithm", HPG 2010), so neighbours share no pattern.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +21,7 @@ from .scene import Scene
 
 mi = mitsuba()
 
-Images = NDArray[np.float32]
+Planes = NDArray[np.float32]
 
 # Offset of ray origins against self-intersection, relative to the larger of the scene's size and
 # the point's coordinates: float32 resolves 2^-23 of them and intersection loses a few bits more.
@@ -43,10 +44,23 @@ def pixel_streams(count: int, seed: int) -> Any:
 
 
 def strata(samples: int) -> tuple[int, int]:
-    """Columns and rows of the grid that holds two of `samples` (even) in each cell."""
+    """Columns and rows of the grid whose cells hold two of about `samples` each.
+
+    Exactly `samples` where that number factors into a grid no longer than 4:1, else a few less
+    in a square one: strata in one dimension alone would double the error.
+    """
     cells = max(1, samples // 2)
-    rows = next(n for n in range(int(cells**0.5), 0, -1) if cells % n == 0)
-    return cells // rows, rows
+    side = math.isqrt(cells)
+    for rows in range(side, 0, -1):
+        if cells % rows == 0 and cells // rows <= 4 * rows:
+            return cells // rows, rows
+    return cells // side, side
+
+
+def rays_used(samples: int) -> int:
+    """How many rays a pixel a reference with `samples` asked for really takes."""
+    columns, rows = strata(samples)
+    return 2 * columns * rows
 
 
 def offset_origin(point: Any, normal: Any, scene: Scene) -> Any:
@@ -59,7 +73,7 @@ def offset_origin(point: Any, normal: Any, scene: Scene) -> Any:
 @dr.syntax
 def ambient_occlusion(
     scene: Scene, hits: Any, *, radius: float, samples: int, seed: int
-) -> tuple[Images, Images]:
+) -> tuple[Planes, Planes]:
     """(1/π)∫ V_R(ω) cosθ dω over the hemisphere about the shading normal; 1 is open.
 
     V_R is 1 when nothing blocks ω within `radius` (scene units). Cosine-weighted directions, two
@@ -104,4 +118,4 @@ def ambient_occlusion(
     return visibility.numpy()[None], error.numpy()[None]
 
 
-REFERENCES: dict[str, Callable[..., tuple[Images, Images]]] = {"ao": ambient_occlusion}
+REFERENCES: dict[str, Callable[..., tuple[Planes, Planes]]] = {"ao": ambient_occlusion}

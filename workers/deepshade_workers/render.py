@@ -16,6 +16,7 @@ from deepshade.camera import Camera
 from deepshade.effects import EFFECTS
 
 from .lighting import direct_light
+from .reference import rays_used
 from .sample import Images, render_sample
 from .scene import Scene
 
@@ -67,7 +68,7 @@ def render(
         "deepshade:aperture": aperture,
         "deepshade:scene": scene.name,
         "deepshade:seed": str(seed),
-        "deepshade:spp": samples,
+        "deepshade:spp": rays_used(samples),
     }
     derive_rest(images, camera, header)
     exr.write(

@@ -75,7 +75,7 @@ def sample_view(
 def _random_camera(
     scene: Scene, rng: np.random.Generator, frame: int, size: int, fov: float
 ) -> Camera | None:
-    """Half of the eyes lie anywhere in the scene's box, half near what they look at."""
+    """Four in ten eyes lie anywhere in the scene's box, the others near what they look at."""
     low, high = scene.bounds
     target = scene.points[rng.integers(len(scene.points))]
     direction = rng.normal(size=3)
