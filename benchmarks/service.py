@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import platform
 import statistics
 import sys
 import threading
@@ -26,7 +25,7 @@ import numpy as np
 import uvicorn
 
 from deepshade import exr
-from deepshade.machine import cpu_count
+from deepshade.machine import cpu_count, describe
 from deepshade_client import answer
 from deepshade_service import shading
 from deepshade_service.app import Service, create_app
@@ -76,9 +75,9 @@ def measure(
     while client.get("/readyz").status_code != 200:
         time.sleep(0.05)
     engine = service.models.pick(effect)
-    gbuffer = shading.decode(
-        [Upload("", "", body)], engine, ShadeParameters(), service.settings.limits
-    )
+    limits = service.settings.limits
+    headers = [exr.read_header(body, limits)]
+    gbuffer = shading.decode([Upload("", "", body)], headers, engine, ShadeParameters(), limits)
     plan = shading.plan(gbuffer, engine, ShadeParameters(), service.settings.memory)
     if len(plan.tiling) != 1:
         raise SystemExit("the picture doesn't fit into one tile: give the service more memory")
@@ -114,8 +113,8 @@ def measure(
     ratios = [a / b for a, b in zip(times["service"], times["network"], strict=True)]
     height, width = gbuffer.shape
     return {
-        "machine": machine(),
-        "bundle": f"{effect}/{engine.bundle.name} {engine.bundle.sha256}",
+        "machine": describe(),
+        "bundle": f"{effect}/{engine.bundle.name} {engine.bundle.short_hash}",
         "engine": f"{engine.name} {engine.precision}, {service.settings.threads} threads",
         "picture": f"{width}x{height}, {len(body):,} bytes",
         "rounds": rounds,
@@ -158,19 +157,9 @@ def spread(values: list[float]) -> dict[str, Any]:
     return {"median": round(middle, 3), "quartiles": [round(low, 3), round(high, 3)]}
 
 
-def machine() -> dict[str, Any]:
-    """The processor, and how much of it we may use."""
-    model = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        lines = (line.partition(":") for line in info.read_text().splitlines())
-        model = next((value.strip() for key, _, value in lines if "model name" in key), model)
-    return {"cpu": model, "cpus": cpu_count(), "system": platform.platform()}
-
-
 def show(result: dict[str, Any]) -> None:
     """Prints the result for people."""
-    print(f"{result['machine']['cpu']}, {result['machine']['cpus']} CPUs")
+    print(result["machine"])
     print(f"{result['bundle']}  {result['engine']}  {result['picture']}  {result['rounds']} rounds")
     for name, value in result["milliseconds"].items():
         low, high = value["quartiles"]

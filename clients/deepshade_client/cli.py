@@ -53,7 +53,7 @@ def shade(
     ] = None,
     profile: Annotated[str | None, typer.Option(help="Renderer whose names to expect.")] = None,
     bundle: Annotated[str | None, typer.Option(help="Which of the effect's bundles.")] = None,
-    png: Annotated[bool, typer.Option("--png", help="8-bit sRGB PNG instead of EXR.")] = False,
+    png: Annotated[bool, typer.Option("--png", help="8-bit PNG instead of EXR.")] = False,
     compression: Annotated[str | None, typer.Option(help="Of the EXR, as zip or piz.")] = None,
     full: Annotated[bool, typer.Option("--float", help="32-bit pixels instead of 16.")] = False,
     together: Annotated[
@@ -66,6 +66,7 @@ def shade(
     as_json: AsJson = False,
 ) -> None:
     """Shade pictures and save the answers."""
+    from deepshade.channels import parse_mapping
     from deepshade_client import batch, report
     from deepshade_client.client import AsyncClient
     from deepshade_client.request import Options
@@ -79,7 +80,7 @@ def shade(
         radius=radius,
         fov=fov,
         profile=profile,
-        mapping=_mapping(map_ or []),
+        mapping=parse_mapping(map_ or []),
         bundle=bundle,
         format="png" if png else "exr",
         compression=compression,
@@ -147,16 +148,6 @@ def _effects(server: str) -> list[dict[str, Any]]:
 
     with Client(server, retry=Retry(attempts=2)) as client:
         return client.effects()
-
-
-def _mapping(entries: list[str]) -> dict[str, str]:
-    mapping = {}
-    for entry in entries:
-        attribute, equals, channel = entry.partition("=")
-        if not (attribute and equals and channel):
-            raise typer.BadParameter(f"--map {entry}: write it as attribute=channel")
-        mapping[attribute] = channel
-    return mapping
 
 
 def _print_json(document: Any) -> None:

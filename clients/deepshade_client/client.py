@@ -15,6 +15,7 @@ from deepshade_client.exceptions import ClientError
 from deepshade_client.request import (
     Options,
     Picture,
+    base_url,
     get_request,
     read_answer,
     read_effects,
@@ -45,7 +46,7 @@ class Client:
         self.server = (server or default_server()).rstrip("/")
         self._retry = retry or Retry()
         self._http = httpx.Client(
-            base_url=self.server + "/",
+            base_url=base_url(self.server),
             timeout=(timeout or Timeout()).as_httpx(),
             transport=transport,
         )
@@ -114,7 +115,7 @@ class AsyncClient:
         self.server = (server or default_server()).rstrip("/")
         self._retry = retry or Retry()
         self._http = httpx.AsyncClient(
-            base_url=self.server + "/",
+            base_url=base_url(self.server),
             timeout=(timeout or Timeout()).as_httpx(),
             transport=transport,
         )

@@ -3,6 +3,7 @@
 ClientError
 ├── TransportError             the request didn't get through
 │   ├── ConnectionFailed         nothing answers at that address
+│   ├── ConnectionBroken         it broke while a request was under way
 │   └── TimedOut                 no answer within the time allowed
 ├── ServerProblem              the service answered with a problem document
 │   ├── BadRequest               400, 404, 408, 413, 415, 422: the request has to change
@@ -30,9 +31,15 @@ class TransportError(ClientError):
 
 
 class ConnectionFailed(TransportError):
-    """Nothing answers at that address, or the connection broke."""
+    """Nothing answers at that address."""
 
     fix = "is the service running (deepshade serve), and is this its address (--server)?"
+
+
+class ConnectionBroken(TransportError):
+    """The connection broke while a request was under way: a restart, or something in between."""
+
+    fix = "try again; if it happens every time, the service's log may say why"
 
 
 class TimedOut(TransportError):

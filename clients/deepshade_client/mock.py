@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Callable
 from typing import Any
@@ -12,9 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepshade import exr
+from deepshade.channels import parse_mapping
 from deepshade.effects import EFFECTS
-from deepshade.errors import DeepshadeError, LimitError, MissingAttributeError
-from deepshade.gbuffer import GBuffer, load_gbuffer
+from deepshade.errors import ConfigError, DeepshadeError
+from deepshade.gbuffer import GBuffer, load_gbuffer, source_name
+from deepshade.problems import MEDIA_TYPE, facts_of, kind_of, type_uri
 
 Shade = Callable[[GBuffer], ArrayLike]
 
@@ -56,36 +59,38 @@ class MockTransport(httpx.BaseTransport, httpx.AsyncBaseTransport):
 
     def _shaded(self, effect: str, request: httpx.Request) -> httpx.Response:
         query = request.url.params
-        mapping = dict(entry.split("=", 1) for entry in query.get_list("map"))
         try:
             gbuffer = load_gbuffer(
                 _files(request),
                 EFFECTS[effect].inputs,
                 profile=query.get("profile"),
-                mapping=mapping,
-                fov=float(query["fov"]) if "fov" in query else None,
+                mapping=parse_mapping(query.get_list("map")),
+                fov=_number(query, "fov", below=180.0),
             )
-        except MissingAttributeError as error:
-            facts = {"missing": error.missing, "found": error.found, "near": error.near}
-            return _problem(422, "missing-attribute", str(error), fix=error.fix, **facts)
-        except LimitError as error:
-            return _problem(413, "over-limit", str(error), fix=error.fix)
+            radius = _number(query, "radius") or 1.0
         except DeepshadeError as error:
-            return _problem(400, "unusable-input", str(error), fix=error.fix)
+            status, kind = kind_of(error)
+            return _problem(status, kind, str(error), fix=error.fix, **facts_of(error))
         shade = np.asarray(self._shade(gbuffer), np.float32)
         planes = shade.reshape(-1, *shade.shape[-2:])
-        stream = io.BytesIO()
-        exr.write(stream, dict(zip(EFFECTS[effect].outputs, planes, strict=True)))
+        if query.get("format") == "png":
+            from deepshade import pictures
+
+            content, kind = pictures.png(pictures.of_effect(planes, EFFECTS[effect])), "image/png"
+        else:
+            stream = io.BytesIO()
+            exr.write(stream, dict(zip(EFFECTS[effect].outputs, planes, strict=True)))
+            content, kind = stream.getvalue(), "image/x-exr"
         headers = {
-            "Content-Type": "image/x-exr",
+            "Content-Type": kind,
             "Server-Timing": "decode;dur=0, plan;dur=0, infer;dur=0, encode;dur=0",
             "Deepshade-Effect": effect,
             "Deepshade-Bundle": "mock",
-            "Deepshade-Radius": query.get("radius", "1"),
+            "Deepshade-Radius": f"{radius:g}",
             "Deepshade-Background-Pixels": str(int(gbuffer.background.sum())),
             "Deepshade-Nonfinite-Pixels": str(gbuffer.nonfinite),
         }
-        return httpx.Response(200, content=stream.getvalue(), headers=headers)
+        return httpx.Response(200, content=content, headers=headers)
 
 
 def _files(request: httpx.Request) -> list[tuple[str, bytes]]:
@@ -96,9 +101,24 @@ def _files(request: httpx.Request) -> list[tuple[str, bytes]]:
     files = []
     for piece in request.content.split(b"--" + boundary[1].encode())[1:-1]:
         head, _, data = piece.partition(b"\r\n\r\n")
+        field = re.search(rb'\bname="([^"]*)"', head)
         filename = re.search(rb'filename="([^"]*)"', head)
-        files.append((filename[1].decode() if filename else "", data.removesuffix(b"\r\n")))
+        name = source_name(*(found[1].decode() if found else "" for found in (field, filename)))
+        files.append((name, data.removesuffix(b"\r\n")))
     return files
+
+
+def _number(query: httpx.QueryParams, name: str, below: float = math.inf) -> float | None:
+    """A positive parameter below a bound; ConfigError for another."""
+    if name not in query:
+        return None
+    try:
+        value = float(query[name])
+    except ValueError:
+        value = math.nan
+    if not 0 < value < below:
+        raise ConfigError(name, detail=f"query.{name}: '{query[name]:.100}' is out of range")
+    return value
 
 
 def _described(name: str) -> dict[str, Any]:
@@ -113,7 +133,5 @@ def _described(name: str) -> dict[str, Any]:
 
 
 def _problem(status: int, kind: str, detail: str, **more: Any) -> httpx.Response:
-    document = {"type": f"urn:deepshade:problem:{kind}", "status": status, "detail": detail}
-    return httpx.Response(
-        status, json=document | more, headers={"Content-Type": "application/problem+json"}
-    )
+    document = {"type": type_uri(kind), "status": status, "detail": detail}
+    return httpx.Response(status, json=document | more, headers={"Content-Type": MEDIA_TYPE})

@@ -16,6 +16,7 @@ from deepshade_client.answer import Answer, facts, timing
 from deepshade_client.exceptions import (
     BadAnswer,
     ClientError,
+    ConnectionBroken,
     ConnectionFailed,
     TimedOut,
     TransportError,
@@ -93,6 +94,23 @@ def read_answer(response: httpx.Response) -> Answer:
     )
 
 
+def base_url(server: str) -> httpx.URL:
+    """The address that requests go below. Raises ClientError for what is none."""
+    try:
+        url = httpx.URL(server + "/")
+    except (httpx.InvalidURL, ValueError) as error:
+        raise _no_address(server, str(error)) from None
+    if url.scheme not in ("http", "https") or not url.host:
+        raise _no_address(server, "it must begin with http:// or https://")
+    return url
+
+
+def _no_address(server: str, why: str) -> ClientError:
+    error = ClientError(f"'{server}' is no address of a service: {why}")
+    error.fix = "write it like http://127.0.0.1:8000"
+    return error
+
+
 def get_request(*path: str) -> dict[str, Any]:
     """The arguments of httpx's `request` for something to look up."""
     return {"method": "GET", "url": "/".join(quote(step, safe="") for step in path)}
@@ -143,7 +161,7 @@ def transport_error(error: httpx.HTTPError, server: str) -> ClientError:
     if isinstance(error, httpx.TimeoutException):
         return TimedOut(f"{server} did not answer in time")
     if isinstance(error, httpx.NetworkError | httpx.RemoteProtocolError):
-        return ConnectionFailed(f"the connection to {server} broke: {error}")
+        return ConnectionBroken(f"the connection to {server} broke: {error}")
     return TransportError(f"the request to {server} failed: {error}")
 
 

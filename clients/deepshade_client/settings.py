@@ -8,7 +8,16 @@ from dataclasses import dataclass
 
 import httpx
 
-from deepshade_client.exceptions import Busy, ClientError, ConnectionFailed, NotReady
+from deepshade_client.exceptions import (
+    Busy,
+    ClientError,
+    ConnectionBroken,
+    ConnectionFailed,
+    NotReady,
+)
+
+_WORTH_IT = (ConnectionFailed, ConnectionBroken, Busy, NotReady)
+_LONGEST_ASKED = 300.0  # seconds; the service asks for a minute at most, a proxy might for a day
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
@@ -40,10 +49,10 @@ class Timeout:
 class Retry:
     """How often to try again, and how long to wait in between.
 
-    Only what may succeed unchanged is tried again: a failed connection, a full queue (429), a
-    service that isn't ready (503). The wait doubles from `first` up to `longest` seconds, with
-    up to a quarter of random extra so that many clients don't come back at once; the service's
-    Retry-After counts if it is longer, but never more than `longest`.
+    Only what may succeed unchanged is tried again: a failed or broken connection, a full queue
+    (429), a service that isn't ready (503). The wait doubles from `first` up to `longest`
+    seconds, with up to a quarter of random extra so that many clients don't come back at once;
+    the service's Retry-After counts if it is longer, but not beyond five minutes.
     """
 
     attempts: int = 6
@@ -52,13 +61,11 @@ class Retry:
 
     def pause(self, error: ClientError, attempt: int) -> float | None:
         """Seconds to wait after the `attempt`-th failure (from 1); None: don't try again."""
-        if attempt >= self.attempts or not isinstance(error, (ConnectionFailed, Busy, NotReady)):
+        if attempt >= self.attempts or not isinstance(error, _WORTH_IT):
             return None
-        wait = self.first * 2.0 ** (attempt - 1)
-        asked = getattr(error, "retry_after", None)
-        if asked is not None:
-            wait = max(wait, asked)
-        return min(self.longest, wait * random.uniform(1.0, 1.25))
+        own = self.first * 2.0 ** (attempt - 1) * random.uniform(1.0, 1.25)
+        asked = getattr(error, "retry_after", None) or 0.0
+        return max(min(self.longest, own), min(asked, _LONGEST_ASKED))
 
 
 NO_RETRY = Retry(attempts=1)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
+import os
 import re
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.errors import BundleError, nearest
-from deepshade.files import replacing
+from deepshade.files import replacing, sha256
 
 MODEL = "model.onnx"
 WEIGHTS = "model.safetensors"
@@ -67,8 +67,13 @@ class Bundle:
 
     @property
     def sha256(self) -> str:
-        """The first 12 digits of the graph's hash: short, for headers and logs."""
-        return self.hashes[MODEL][:12]
+        """The graph's hash."""
+        return self.hashes[MODEL]
+
+    @property
+    def short_hash(self) -> str:
+        """Its first 12 digits, for people."""
+        return self.sha256[:12]
 
     @classmethod
     def load(cls, path: Path | str) -> Bundle:
@@ -82,7 +87,7 @@ class Bundle:
         metrics = _read_json(path / METRICS) if (path / METRICS).exists() else {}
         bundle = _from_config(path, config, metrics)
         for name, expected in bundle.hashes.items():
-            found = file_sha256(path / name)
+            found = _hash(path / name)
             if found != expected:
                 raise BundleError(
                     f"{path / name} is not the file that {CONFIG} describes "
@@ -92,12 +97,18 @@ class Bundle:
         return bundle
 
 
-def find_bundles(root: Path | str) -> list[Bundle]:
-    """Every bundle under `root`/<effect>/<name>/, verified, by effect and name.
+def bundle_root() -> Path:
+    """Where models are: $DEEPSHADE_MODELS, else ./models if it is there, else the sources' own."""
+    chosen = os.environ.get("DEEPSHADE_MODELS")
+    if chosen:
+        return Path(chosen)
+    here = Path("models")
+    return here if here.is_dir() else Path(__file__).resolve().parents[2] / "models"
 
-    An absent root holds none. Raises BundleError if one of them is broken.
-    """
-    return [Bundle.load(path.parent) for path in sorted(Path(root).glob(f"*/*/{CONFIG}"))]
+
+def bundle_folders(root: Path | str) -> list[Path]:
+    """The folder of every bundle under `root`/<effect>/<name>/, unverified, by effect and name."""
+    return [path.parent for path in sorted(Path(root).glob(f"*/*/{CONFIG}"))]
 
 
 def write_config(
@@ -138,7 +149,7 @@ def write_config(
         "size_multiple": size_multiple,
         "halo": halo,
         "ranges": {key: list(value) for key, value in (ranges or {}).items()},
-        "hashes": {file: file_sha256(path / file) for file in (MODEL, WEIGHTS)},
+        "hashes": {file: _hash(path / file) for file in (MODEL, WEIGHTS)},
     }
     bundle = _from_config(path, config, dict(metrics or {}))
     if metrics is not None:
@@ -147,18 +158,13 @@ def write_config(
     return bundle
 
 
-def file_sha256(path: Path) -> str:
-    """The sha256 of a file, hexadecimal. Raises BundleError if it is absent or too large."""
+def _hash(path: Path) -> str:
+    """Raises BundleError if the file is absent, too large or unreadable."""
     _check_size(path)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def config_of(bundle: Bundle) -> dict[str, Any]:
-    """What `config.json` says, as plain JSON values."""
-    config = asdict(bundle)
-    del config["path"], config["metrics"]
-    return {key: list(v) if isinstance(v, tuple) else v for key, v in config.items()}
+    try:
+        return sha256(path)
+    except OSError as error:
+        raise BundleError(f"can't read {path}: {error.strerror}") from None
 
 
 def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any]) -> Bundle:
@@ -197,7 +203,9 @@ def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any])
 
 
 def _number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) <= sys.float_info.max  # false for NaN, and for integers beyond any float
 
 
 def _whole(value: Any, lowest: int, highest: int) -> bool:
@@ -232,7 +240,7 @@ def _hashes(value: Any) -> bool:
 
 
 _CHECKS: dict[str, tuple[Any, str]] = {
-    "effect": (lambda v: v in EFFECTS, f"one of {', '.join(EFFECTS)}"),
+    "effect": (lambda v: isinstance(v, str) and v in EFFECTS, f"one of {', '.join(EFFECTS)}"),
     "name": (_label, "a short name of letters, digits, '.', '_' and '-'"),
     "version": (_label, "a short text of letters, digits, '.', '_' and '-'"),
     "inputs": (_names, "a list of attribute names"),

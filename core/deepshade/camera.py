@@ -25,7 +25,8 @@ class Camera:
     `world_to_camera` is (4, 4) float64 and multiplies column vectors; None when unknown.
     `x0`, `y0` is where the stored pixels (the data window) start within the frame.
     `center` is the optical axis' offset from the frame's middle (OpenEXR's screenWindowCenter,
-    in units of the image plane at distance 1), for shifted lenses.
+    in units of the image plane at distance 1), for shifted lenses. `pixel_aspect` is a pixel's
+    width divided by its height (OpenEXR's pixelAspectRatio): 2 for an anamorphic squeeze.
     """
 
     fov: float
@@ -35,6 +36,7 @@ class Camera:
     x0: int = 0
     y0: int = 0
     center: tuple[float, float] = (0.0, 0.0)
+    pixel_aspect: float = 1.0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.fov) and 0.0 < self.fov < 180.0):
@@ -100,7 +102,7 @@ class Camera:
 
     @property
     def pixels_per_unit(self) -> float:
-        """Pixels that a length of 1 at distance 1 spans: (width / 2) / tan(fov / 2)."""
+        """Pixels that a horizontal length of 1 at distance 1 spans: (width / 2) / tan(fov / 2)."""
         return 0.5 * self.width / math.tan(math.radians(self.fov) / 2)
 
     def rays(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
@@ -112,7 +114,8 @@ class Camera:
         height = self.height if height is None else height
         scale = 1.0 / self.pixels_per_unit
         x = (np.arange(width) + (self.x0 + 0.5 - 0.5 * self.width)) * scale + self.center[0]
-        y = (0.5 * self.height - self.y0 - 0.5 - np.arange(height)) * scale + self.center[1]
+        y = 0.5 * self.height - self.y0 - 0.5 - np.arange(height)
+        y = y * (scale / self.pixel_aspect) + self.center[1]
         out = np.empty((3, height, width), np.float32)
         out[0] = x
         out[1] = y[:, None]
@@ -134,6 +137,8 @@ class Camera:
             "screenWindowWidth": 2.0 * math.tan(math.radians(self.fov) / 2),
             "screenWindowCenter": tuple(float(c) for c in self.center),
         }
+        if self.pixel_aspect != 1.0:
+            header["pixelAspectRatio"] = float(self.pixel_aspect)
         if self.world_to_camera is not None:
             # Imath multiplies row vectors, so the file holds the transpose
             header["worldToCamera"] = self.world_to_camera.T.astype(np.float32)
@@ -162,6 +167,7 @@ class Camera:
             fov = math.degrees(2.0 * math.atan(screen_width / 2))
         if fov is None:
             return None
+        aspect = _number(attributes.get("pixelAspectRatio"))
         return cls(
             fov=float(fov),
             width=display_window[2] - display_window[0] + 1,
@@ -170,6 +176,7 @@ class Camera:
             x0=data_window[0] - display_window[0],
             y0=data_window[1] - display_window[1],
             center=_pair(attributes.get("screenWindowCenter")),
+            pixel_aspect=aspect if aspect is not None and aspect > 0 else 1.0,
         )
 
 

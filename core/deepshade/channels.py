@@ -19,6 +19,11 @@ _COMPONENTS = {letter: letter for letter in "xyzwrgbauvt"} | {
     "alpha": "a",
 }
 # which components may stand for one, two or three values, best first
+# Names come from strangers: what is compared for a hint is bounded, whatever a file holds.
+_LONGEST_NAME = 64
+_MOST_WORDS_OF_A_NAME = 8
+_MOST_WORDS = 1024
+_CLOSE = 0.6  # difflib's ratio
 _SETS = {3: ("xyz", "rgb"), 2: ("uv", "xy", "rg"), 1: ("v", "z", "t", "y", "r", "x", "a")}
 
 
@@ -81,9 +86,9 @@ def parse_mapping(pairs: Iterable[str]) -> dict[str, str]:
     for pair in pairs:
         name, equals, target = (piece.strip() for piece in pair.partition("="))
         if not (name and equals and target):
-            raise ConfigError(pair, detail=f"'{pair}' is no attribute=channel pair")
+            raise ConfigError(pair, detail=f"'{pair:.100}' is no attribute=channel pair")
         if name in mapping:
-            raise ConfigError(name, detail=f"'{name}' is mapped twice")
+            raise ConfigError(name, detail=f"'{name:.100}' is mapped twice")
         mapping[name] = target
     return mapping
 
@@ -92,9 +97,9 @@ def layers(headers: Sequence[Header], stems: Sequence[str]) -> list[Layer]:
     """Groups every channel of every file into layers. `stems` are the file names ("" if none)."""
     found: dict[tuple[int, int, str], Layer] = {}
     for file, (header, stem) in enumerate(zip(headers, stems, strict=True)):
+        bare = [{n.lower() for n in part.channels if "." not in n} for part in header.parts]
         for qualified, (part, channel) in header.channels().items():
-            bare = {name.lower() for name in header.parts[part].channels if "." not in name}
-            layer, component = _split(channel, bare)
+            layer, component = _split(channel, bare[part])
             key = (file, part, layer)
             if key not in found:
                 name = layer or (header.parts[part].name if len(header.parts) > 1 else "")
@@ -144,29 +149,56 @@ def choose(
     return found, ambiguous
 
 
-def near_misses(layers: Sequence[Layer], attribute: str) -> tuple[str, ...]:
-    """Names of layers and channels that look as if they were meant for `attribute`."""
+def near_misses(layers: Sequence[Layer], attributes: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """For each attribute the names of layers and channels that look as if they were meant for it.
+
+    At most three, best first. Long names and very many names are compared in part.
+    """
+    words = {name: _words_for(name) for name in attributes}
+    scores: dict[str, dict[str, float]] = {}  # word of a layer's name -> attribute -> closeness
+    best: dict[str, dict[str, float]] = {name: {} for name in attributes}
+    for layer in layers:
+        label = layer.name or (layer.channels[0] if len(layer.channels) == 1 else "")
+        name = label[:_LONGEST_NAME].lower()
+        pieces = [piece for piece in re.split(r"[._:/\-\s]+", name) if piece]
+        for piece in dict.fromkeys((name, *pieces[-_MOST_WORDS_OF_A_NAME:])):
+            if piece not in scores and len(scores) < _MOST_WORDS:
+                scores[piece] = _closeness(piece, words)
+            for attribute, score in scores.get(piece, {}).items():
+                best[attribute][label] = max(score, best[attribute].get(label, 0.0))
+    return {
+        attribute: tuple(sorted(scored, key=lambda name: -scored[name])[:3])
+        for attribute, scored in best.items()
+    }
+
+
+def _words_for(attribute: str) -> set[str]:
+    """What an attribute is called: by us, and by the renderers that we know."""
     aliases = {attribute, *ATTRIBUTES[attribute].channels} if attribute in ATTRIBUTES else set()
     for p in PROFILES.values():
         for source in p.sources:
             if source.quantity.split("_world")[0] == attribute.split("_world")[0]:
                 aliases |= set(source.layers)
-    words = [alias.lower() for alias in aliases if len(alias) > 2]
-    scored: dict[str, float] = {}
-    for layer in layers:
-        name = layer.name or (layer.channels[0] if len(layer.channels) == 1 else "")
-        pieces = [piece for piece in re.split(r"[._:/\-\s]+", name.lower()) if piece] or [""]
-        best = max(
-            (
-                difflib.SequenceMatcher(None, piece, word).ratio()
-                for piece in (*pieces, name.lower())
-                for word in words
-            ),
-            default=0.0,
-        )
-        if best >= 0.6 and name:
-            scored[name] = max(best, scored.get(name, 0.0))
-    return tuple(sorted(scored, key=lambda name: -scored[name])[:3])
+    return {alias.lower() for alias in aliases if len(alias) > 2}
+
+
+def _closeness(piece: str, words: Mapping[str, Iterable[str]]) -> dict[str, float]:
+    """How close `piece` comes to the words of each attribute, for those that it comes close to."""
+    if not piece:
+        return {}
+    found: dict[str, float] = {}
+    matcher = difflib.SequenceMatcher(None)
+    matcher.set_seq2(piece)  # the one that it prepares for
+    for attribute, mine in words.items():
+        for word in mine:
+            matcher.set_seq1(word)
+            least = max(_CLOSE, found.get(attribute, 0.0))
+            # upper bounds first: nearly all words fail them
+            if matcher.real_quick_ratio() >= least and matcher.quick_ratio() >= least:
+                ratio = matcher.ratio()
+                if ratio >= least:
+                    found[attribute] = ratio
+    return found
 
 
 def missing(
@@ -174,8 +206,7 @@ def missing(
 ) -> MissingAttributeError:
     """The error that names what is missing, what was found, and what comes near."""
     found = [name for layer in layers for name in layer.channels]
-    near = {name: near_misses(layers, name) for name in attributes}
-    return MissingAttributeError(attributes, found, near, why=why)
+    return MissingAttributeError(attributes, found, near_misses(layers, attributes), why=why)
 
 
 def _split(channel: str, bare: set[str]) -> tuple[str, str]:

@@ -83,6 +83,9 @@ def run(command: Any, argv: Sequence[str] | None = None, *, name: str) -> int:
         # the interpreter flushes once more when it ends: let that go nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _complain(f"{where}{error.strerror or error}", "")
     except Exception as error:
         return _usage_error(error)
 

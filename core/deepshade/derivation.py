@@ -20,6 +20,8 @@ from deepshade.geometry import normals_from_positions, unit
 Array = NDArray[np.float32]
 Requirement = Literal["fov", "matrix", "lens"]
 
+_PIECE = 2**13  # pixels transformed at a time
+
 _REQUIREMENTS: dict[str, str] = {
     "fov": "the field of view",
     "matrix": "the camera's matrix (worldToCamera)",
@@ -69,10 +71,15 @@ class Derivation:
 def _position_from_world(s: Source) -> Array:
     matrix = s.world_to_camera
     points = s.arrays["position_world"]
-    # float64 for the product alone: world coordinates can be large beside the scene's detail
-    flat = matrix[:3, :3] @ points.reshape(3, -1).astype(np.float64)
-    flat += matrix[:3, 3:]
-    return flat.astype(np.float32).reshape(points.shape)
+    flat = points.reshape(3, -1)
+    out = np.empty_like(flat)
+    # float64 for the product alone, because world coordinates can be large beside the scene's
+    # detail, and piecewise, because it would take five times the picture's memory
+    for at in range(0, flat.shape[1], _PIECE):
+        piece = matrix[:3, :3] @ flat[:, at : at + _PIECE].astype(np.float64)
+        piece += matrix[:3, 3:]
+        out[:, at : at + _PIECE] = piece
+    return out.reshape(points.shape)
 
 
 def _position_from_depth(s: Source) -> Array:

@@ -131,10 +131,10 @@ def check_machine() -> list[Check]:
 
 def check_bundles(root: Path | None = None) -> list[Check]:
     """The shipped models: each must match its hashes."""
-    from deepshade.bundles import Bundle
+    from deepshade.bundles import Bundle, bundle_folders, bundle_root
 
     root = root or bundle_root()
-    folders = [path.parent for path in sorted(root.glob("*/*/config.json"))]
+    folders = bundle_folders(root)
     if not folders:
         return [
             Check("models", False, False, f"none in {root}", "deepshade export, or get models/")
@@ -147,7 +147,7 @@ def check_bundles(root: Path | None = None) -> list[Check]:
         except BundleError as error:
             checks.append(Check(name, False, True, str(error), error.fix))
         else:
-            checks.append(Check(name, True, True, f"sha256 {bundle.sha256}…"))
+            checks.append(Check(name, True, True, f"sha256 {bundle.short_hash}…"))
     return checks
 
 
@@ -162,12 +162,6 @@ def check_port(port: int = 8000) -> list[Check]:
             fix = f"stop what listens there (ss -ltnp 'sport = :{port}'), or serve --port elsewhere"
             return [Check(f"port {port}", False, False, detail, fix)]
     return [Check(f"port {port}", True, False, "free")]
-
-
-def bundle_root() -> Path:
-    """Where the shipped bundles are: `DEEPSHADE_MODELS`, or `models/` of the source tree."""
-    chosen = os.environ.get("DEEPSHADE_MODELS")
-    return Path(chosen) if chosen else Path(__file__).resolve().parents[2] / "models"
 
 
 _CHECKS: tuple[Callable[[], list[Check]], ...] = (

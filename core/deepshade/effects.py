@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from deepshade.attributes import ATTRIBUTES
 
@@ -13,7 +14,8 @@ class Effect:
 
     `inputs` are attribute names in network order. A `per_channel` effect is one network, trained
     on one channel, run on each of its colour channels; `outputs` are the answer's EXR channels.
-    `background` is the answer where there is no geometry.
+    `background` is the answer where there is no geometry. `picture` is how 8-bit pictures show it:
+    light goes through sRGB's curve, a factor such as occlusion does not.
     """
 
     name: str
@@ -23,6 +25,7 @@ class Effect:
     per_channel: bool
     background: float
     reference: str
+    picture: Literal["linear", "srgb"] = "srgb"
 
     @property
     def input_channels(self) -> tuple[str, ...]:
@@ -42,6 +45,7 @@ _TABLE = (
         per_channel=False,
         background=1.0,
         reference="(1/π)∫ V_R cosθ dω; 1 = open",
+        picture="linear",
     ),
     Effect(
         "do",

@@ -29,8 +29,10 @@ class LimitError(DeepshadeError):
     def __init__(self, limit: str, value: int, maximum: int) -> None:
         what = limit.replace("_", " ")
         super().__init__(
-            f"the image has {value:,} {what}, the limit is {maximum:,}",
-            fix=f"send a smaller image, or raise the limit '{limit}'",
+            f"the image needs {value:,} {what}, the limit is {maximum:,}"
+            if limit == "memory_bytes"
+            else f"the image has {value:,} {what}, the limit is {maximum:,}",
+            fix=f"use a smaller image, or allow more: Limits({limit}=...)",
         )
         self.limit = limit
         self.value = value
@@ -67,8 +69,9 @@ class AmbiguousChannelError(DeepshadeError):
     """Several channels could be the same attribute; deepshade never guesses."""
 
     def __init__(self, attribute: str, candidates: Sequence[str]) -> None:
+        shown = ", ".join(candidates[:24]) + (", …" if len(candidates) > 24 else "")
         super().__init__(
-            f"'{attribute}' could be any of: {', '.join(candidates)}",
+            f"'{attribute}' could be any of: {shown}",
             fix=f"choose one: --map {attribute}={candidates[0]}" if candidates else "",
         )
         self.attribute = attribute

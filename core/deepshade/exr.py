@@ -84,15 +84,18 @@ def read(
     source: Path | str | bytes,
     channels: Collection[str] | None = None,
     limits: Limits | None = None,
+    *,
+    header: Header | None = None,
 ) -> Image:
     """Decodes an EXR file, or its bytes, into float32 (half and uint are converted).
 
     `channels` selects, and orders in memory, the wanted ones by their `Header.channels()`
-    names; None is all. Raises ImageError, DamagedImageError, LimitError.
+    names; None is all. `header` is what `read_header` gave for the same bytes, to spare reading
+    it again. Raises ImageError, DamagedImageError, LimitError.
     """
     limits = limits or Limits()
     data = fetch(source, limits)
-    header = parse(memoryview(data), limits)
+    header = header or parse(memoryview(data), limits)
     places = header.channels()
     wanted = list(places) if channels is None else list(dict.fromkeys(channels))
     for name in wanted:

@@ -25,7 +25,8 @@ Buffer = memoryview
 
 _MAGIC = 20000630
 _TILED, _LONG_NAMES, _DEEP, _MULTIPART = 0x200, 0x400, 0x800, 0x1000
-_MAX_ATTRIBUTES = 20_000  # a part; the busiest production files have a few hundred
+_MAX_ATTRIBUTES = 4_000  # of all parts; the busiest production files have a few hundred
+_MAX_TEXTS = 4_000  # in one attribute
 _MAX_COORDINATE = 2**30 - 2  # OpenEXR's own bound on windows
 _MAX_TILE = 2**16
 _TABLE_BLOCK = 2**16  # chunk table entries checked at a time, to bound the memory it takes
@@ -152,10 +153,12 @@ def parse(data: Buffer, limits: Limits) -> Header:
     if flags & _DEEP:
         raise _deep()
     multipart = bool(flags & _MULTIPART)
-    raws = [_read_part(cursor, limits)]
+    raws = [_read_part(cursor, limits, _MAX_ATTRIBUTES)]
+    left = _MAX_ATTRIBUTES - len(raws[0].types)
     while multipart and cursor.peek() != 0:
         limits.check("parts", len(raws) + 1)
-        raws.append(_read_part(cursor, limits))
+        raws.append(_read_part(cursor, limits, left))
+        left -= len(raws[-1].types)
         limits.check("channels", sum(len(raw.channels) for raw in raws))
     if multipart:
         cursor.skip(1)
@@ -219,9 +222,10 @@ class _Cursor:
         return np.frombuffer(self.data, "<u8", count, start)
 
 
-def _read_part(cursor: _Cursor, limits: Limits) -> _Raw:
+def _read_part(cursor: _Cursor, limits: Limits, most: int) -> _Raw:
+    """One part's header, which may have at most `most` attributes."""
     raw = _Raw()
-    for _ in range(_MAX_ATTRIBUTES):
+    for _ in range(most + 1):
         name = cursor.name()
         if not name:
             return raw
@@ -241,7 +245,9 @@ def _read_part(cursor: _Cursor, limits: Limits) -> _Raw:
                 raise DamagedImageError(
                     f"the header attribute '{name}' is no valid {kind}"
                 ) from None
-    raise DamagedImageError(f"a part's header has over {_MAX_ATTRIBUTES:,} attributes")
+    raise ImageError(
+        f"the header has over {_MAX_ATTRIBUTES:,} attributes", fix="save it without metadata"
+    )
 
 
 def _read_channels(value: Buffer, raw: _Raw, limits: Limits) -> None:
@@ -417,8 +423,11 @@ def _text(value: Buffer) -> str:
 
 
 def _texts(value: Buffer) -> list[str]:
-    cursor, out = _Cursor(value, 0), []
+    cursor = _Cursor(value, 0)
+    out: list[str] = []
     while cursor.at < len(value):
+        if len(out) == _MAX_TEXTS:
+            raise ValueError
         (size,) = cursor.unpack("<i")
         start = cursor.skip(size)
         out.append(_text(value[start : start + size]))

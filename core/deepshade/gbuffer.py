@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,7 +33,8 @@ class GBuffer:
     `attributes` maps names to (C, H, W) float32, C-contiguous; every attribute is 0 where
     `background` (H, W) is true. `nonfinite` counts the pixels that held NaN or infinities (an
     infinite depth is a renderer's way to say background and doesn't count). `mapped` tells which
-    channels each quantity came from, `derived` how the others were computed.
+    channels each quantity came from, `derived` how the others were computed. The windows,
+    (x0, y0, x1, y1) inclusive, are those of the part that the attributes came from.
     """
 
     attributes: dict[str, NDArray[np.float32]]
@@ -42,6 +44,8 @@ class GBuffer:
     mapped: dict[str, str] = field(default_factory=dict)
     derived: dict[str, str] = field(default_factory=dict)
     header: dict[str, Any] = field(default_factory=dict)
+    data_window: exr.Window = (0, 0, 0, 0)
+    display_window: exr.Window = (0, 0, 0, 0)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -70,6 +74,22 @@ class Plan:
     def met(self) -> set[derivation.Requirement]:
         """The camera facts that are known."""
         return derivation.requirements(self.camera, self.matrix, self.attributes)
+
+    def complete(self, choice: channels.Choice, window: exr.Window) -> bool:
+        """Whether all its channels have a value for each pixel of that data window."""
+        bare = [self._places(choice)[name][1] for name in choice.channels]
+        return all(
+            part.data_window == window and name not in part.subsampled
+            for part, name in zip(self.parts(choice), bare, strict=True)
+        )
+
+    def _places(self, choice: channels.Choice) -> dict[str, tuple[int, str]]:
+        return self.headers[choice.file].channels()
+
+    def parts(self, choice: channels.Choice) -> list[exr.Part]:
+        """The part of each of its channels."""
+        places = self._places(choice)
+        return [self.headers[choice.file].parts[places[name][0]] for name in choice.channels]
 
     def explain(self, attribute: str) -> str:
         """Why `attribute` can't be had, for errors and reports."""
@@ -122,13 +142,15 @@ def load_gbuffer(
     mapping: Mapping[str, str] | None = None,
     fov: float | None = None,
     limits: Limits | None = None,
+    headers: Sequence[Header] | None = None,
 ) -> GBuffer:
     """Loads the attributes `needs` from one EXR file, or from several of one view.
 
     A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
     (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
     comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
-    What isn't there is derived (`derivation`), and `GBuffer.derived` says how.
+    What isn't there is derived (`derivation`), and `GBuffer.derived` says how. `headers` are what
+    `exr.read_header` gave for the same sources, to spare reading them again.
 
     Raises ImageError, DamagedImageError, LimitError, MissingAttributeError,
     AmbiguousChannelError, CameraError, ConfigError.
@@ -138,7 +160,7 @@ def load_gbuffer(
         if name not in ATTRIBUTES:
             raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called '{name}'")
     stems, bodies = _fetch(sources, limits)
-    headers = [exr.read_header(body, limits) for body in bodies]
+    headers = headers or [exr.read_header(body, limits) for body in bodies]
     _check_together(headers, limits)
     planned = plan_gbuffer(headers, stems, needs, profile=profile, mapping=mapping, fov=fov)
     planned.require(needs)
@@ -147,10 +169,12 @@ def load_gbuffer(
         for step in derivation.plan(name, {*planned.choices, *steps}, planned.met) or ():
             steps.setdefault(step.target, step)
 
-    used = {*needs, *(need for step in steps.values() for need in step.needs), *_MARKERS}
-    choices = {name: choice for name, choice in planned.choices.items() if name in used}
-    _check_windows(headers, choices)
-    arrays = _read(bodies, choices, limits)
+    used = {*needs, *(need for step in steps.values() for need in step.needs)}
+    choices = _chosen(planned, used, mapping or {})
+    part = planned.parts(next(iter(choices.values())))[0]
+    if planned.camera:
+        planned.camera = _framed(planned.camera, part)
+    arrays = _read(bodies, headers, choices, limits)
     background, nonfinite = _background(arrays)
     _clear(arrays.values(), background)
     source = derivation.Source(
@@ -176,7 +200,14 @@ def load_gbuffer(
         mapped={name: str(choice) for name, choice in choices.items()},
         derived={name: planned.how(step) for name, step in steps.items()},
         header=planned.attributes,
+        data_window=part.data_window,
+        display_window=part.display_window,
     )
+
+
+def source_name(field: str, filename: str) -> str:
+    """What a form's file is called: its field if that names a quantity, else its file name."""
+    return f"{field}.exr" if field in QUANTITIES else filename
 
 
 def plan_gbuffer(
@@ -196,7 +227,8 @@ def plan_gbuffer(
     attributes: dict[str, Any] = {}
     for header in headers:
         for part in header.parts:
-            attributes = {**part.attributes, **attributes}
+            for key, value in part.attributes.items():
+                attributes.setdefault(key, value)
     known = profile_named(profile) if profile else detect(attributes)
     layers = channels.layers(headers, stems)
     wanted = list(dict.fromkeys((*needs, *_related(needs), *_MARKERS)))
@@ -292,13 +324,26 @@ def _check_together(headers: Sequence[Header], limits: Limits) -> None:
     limits.check("decoded_bytes", sum(header.decoded_bytes for header in headers))
 
 
-def _check_windows(headers: Sequence[Header], choices: Mapping[str, channels.Choice]) -> None:
+def _chosen(
+    plan: Plan, used: Collection[str], mapping: Collection[str]
+) -> dict[str, channels.Choice]:
+    """What is read: the choices that are `used`, and the markers that fit them.
+
+    A depth or alpha that only marks the background, and covers other pixels (an auto-cropped
+    beauty pass) or is subsampled, is passed over, unless the mapping asks for it. Raises
+    ImageError when the choices that are used cover different pixels.
+    """
+    chosen = {
+        name: choice
+        for name, choice in plan.choices.items()
+        if name in used or (name in _MARKERS and name in mapping)
+    }
+    # the markers come last: the first choice, whose window counts, is one that is needed
+    chosen = dict(sorted(chosen.items(), key=lambda item: item[0] not in used))
     windows: dict[exr.Window, str] = {}
-    for name, choice in choices.items():
-        header = headers[choice.file]
-        places = header.channels()
-        for channel in choice.channels:
-            windows.setdefault(header.parts[places[channel][0]].data_window, name)
+    for name, choice in chosen.items():
+        for part in plan.parts(choice):
+            windows.setdefault(part.data_window, name)
     if len(windows) > 1:
         sizes = ", ".join(
             f"'{name}' {x1 - x0 + 1} x {y1 - y0 + 1} at ({x0}, {y0})"
@@ -307,6 +352,21 @@ def _check_windows(headers: Sequence[Header], choices: Mapping[str, channels.Cho
         raise ImageError(
             f"the attributes cover different pixels: {sizes}", fix="render them as one view"
         )
+    window = next(iter(windows))
+    markers = {
+        name: plan.choices[name]
+        for name in _MARKERS
+        if name in plan.choices and plan.complete(plan.choices[name], window)
+    }
+    return {**chosen, **{name: markers[name] for name in markers if name not in chosen}}
+
+
+def _framed(camera: Camera, part: exr.Part) -> Camera:
+    """The camera for the windows of `part`."""
+    (x0, y0, *_), (left, top, right, bottom) = part.data_window, part.display_window
+    return replace(
+        camera, width=right - left + 1, height=bottom - top + 1, x0=x0 - left, y0=y0 - top
+    )
 
 
 def _check_side(arrays: Mapping[str, NDArray[np.float32]], background: NDArray[np.bool_]) -> None:
@@ -324,20 +384,24 @@ def _check_side(arrays: Mapping[str, NDArray[np.float32]], background: NDArray[n
 
 
 def _read(
-    bodies: Sequence[bytes], choices: Mapping[str, channels.Choice], limits: Limits
+    bodies: Sequence[bytes],
+    headers: Sequence[Header],
+    choices: Mapping[str, channels.Choice],
+    limits: Limits,
 ) -> dict[str, NDArray[np.float32]]:
     arrays: dict[str, NDArray[np.float32]] = {}
-    for index, body in enumerate(bodies):
+    for index, (body, header) in enumerate(zip(bodies, headers, strict=True)):
         mine = {name: choice for name, choice in choices.items() if choice.file == index}
         if not mine:
             continue
-        image = exr.read(body, [c for choice in mine.values() for c in choice.channels], limits)
-        taken: set[str] = set()
+        wanted = [channel for choice in mine.values() for channel in choice.channels]
+        image = exr.read(body, wanted, limits, header=header)
+        users = Counter(channel for choice in mine.values() for channel in set(choice.channels))
         for name, choice in mine.items():
             array = image.stack(choice.channels)
-            if taken & set(choice.channels):  # two attributes share a channel: not its memory
+            # attributes that share a channel don't share its memory: each has signs of its own
+            if any(users[channel] > 1 for channel in choice.channels):
                 array = array.copy()
-            taken |= set(choice.channels)
             for plane, sign in zip(array, choice.signs, strict=False):
                 if sign < 0:
                     np.negative(plane, out=plane)

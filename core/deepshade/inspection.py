@@ -123,7 +123,7 @@ def _effect(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
         except AmbiguousChannelError as error:
             missing[name] = {"why": str(error), "fix": error.fix, "near": list(error.candidates)}
         except DeepshadeError as error:
-            near = list(near_misses(plan.layers, name))
+            near = list(near_misses(plan.layers, [name])[name])
             missing[name] = {"why": plan.explain(name), "fix": error.fix, "near": near}
         else:
             steps = plan.steps(name) or []
@@ -145,7 +145,7 @@ def _statistics(plan: Plan, bodies: Sequence[bytes], limits: Limits) -> dict[str
         if not mine:
             continue
         wanted = [channel for choice in mine.values() for channel in choice.channels]
-        image = exr.read(body, wanted, limits)
+        image = exr.read(body, wanted, limits, header=plan.headers[index])
         for name, choice in mine.items():
             values = image.stack(choice.channels)
             finite = np.isfinite(values).all(axis=0)

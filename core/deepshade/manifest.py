@@ -7,7 +7,6 @@ unfinished.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -97,9 +96,3 @@ def shard_path(folder: Path, shard: Shard) -> Path:
     if Path(shard.file).name != shard.file:
         raise DataError(f"the manifest names {shard.file!r}, which is not in its folder")
     return folder / shard.file
-
-
-def sha256(path: Path) -> str:
-    """Hex digest of a file's bytes."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from deepshade.effects import Effect
 from deepshade.files import replacing
 
 Picture = NDArray[np.uint8]
@@ -38,6 +39,11 @@ def shading(image: ArrayLike) -> Picture:
     planes = planes[None] if planes.ndim == 2 else planes
     pixels = np.rint(255 * np.clip(np.nan_to_num(planes), 0, 1)).astype(np.uint8)
     return np.ascontiguousarray(np.broadcast_to(pixels, (3, *pixels.shape[1:])).transpose(1, 2, 0))
+
+
+def of_effect(image: ArrayLike, effect: Effect) -> Picture:
+    """(H, W, 3) of an effect's answer, as `effect.picture` says: `srgb` or `shading`."""
+    return shading(image) if effect.picture == "linear" else srgb(image)
 
 
 def normals(image: ArrayLike) -> Picture:

@@ -15,12 +15,13 @@ from fastapi.responses import HTMLResponse, PlainTextResponse
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
+from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade_service import problems
 from deepshade_service.config import Settings
 from deepshade_service.engine import Engine
 from deepshade_service.job import Answer, Job
 from deepshade_service.memory import MemoryBudget, trim
-from deepshade_service.middleware import Counting
+from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, not_ready
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.pool import Cancelled, Workers
@@ -98,6 +99,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.service = service
     problems.install(app)
     app.add_middleware(Counting, telemetry=service.telemetry)
+    app.add_middleware(Closing)
 
     @app.post(
         "/shade/{effect}",
@@ -249,7 +251,7 @@ _SHADE_RESPONSES: dict[int | str, Any] = {
     }
 }
 _SHADE_RESPONSES |= {
-    status: {"description": text, "content": {problems.MEDIA_TYPE: {"schema": _PROBLEM}}}
+    status: {"description": text, "content": {PROBLEM_TYPE: {"schema": _PROBLEM}}}
     for status, text in {
         400: "No EXR, or a damaged one",
         404: "Unknown effect, or no bundle for it",

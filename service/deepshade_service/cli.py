@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import socket
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,12 +14,26 @@ if TYPE_CHECKING:
     from deepshade_service.config import Settings
 
 
+class LogLevel(StrEnum):
+    """What `--log-level` may be."""
+
+    critical = "critical"
+    error = "error"
+    warning = "warning"
+    info = "info"
+    debug = "debug"
+
+
 def serve(
     host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 8000,
     models: Annotated[
-        Path, typer.Option(help="Folder of bundles, <effect>/<name>/.", envvar="DEEPSHADE_MODELS")
-    ] = Path("models"),
+        Path | None,
+        typer.Option(
+            help="Folder of bundles, <effect>/<name>/. Default: $DEEPSHADE_MODELS, ./models, or"
+            " the models that came with the sources."
+        ),
+    ] = None,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Of a network run. Default: the CPUs we may use.")
     ] = None,
@@ -29,6 +44,11 @@ def serve(
         typer.Option(help="For pixels and networks, as 2G. Default: half of the machine's."),
     ] = None,
     max_body: Annotated[str | None, typer.Option(help="Largest body, as 500M.")] = None,
+    max_uploads: Annotated[
+        str | None,
+        typer.Option(help="For bodies that arrive or wait, in sum. Default: twice --max-body."),
+    ] = None,
+    max_files: Annotated[int, typer.Option(min=1, help="Most files of a form.")] = 32,
     max_decoded: Annotated[str | None, typer.Option(help="Largest decoded file.")] = None,
     max_pixels: Annotated[int | None, typer.Option(min=1, help="Most pixels of a part.")] = None,
     max_parts: Annotated[int | None, typer.Option(min=1, help="Most parts of a file.")] = None,
@@ -37,14 +57,19 @@ def serve(
     ] = None,
     body_timeout: Annotated[float, typer.Option(help="Seconds for a body to arrive.")] = 60.0,
     grace: Annotated[float, typer.Option(help="Seconds to finish work at the end.")] = 20.0,
-    log_level: Annotated[str, typer.Option(help="critical, error, warning, info.")] = "info",
+    log_level: Annotated[
+        LogLevel, typer.Option(case_sensitive=False, help="The least that is logged.")
+    ] = LogLevel.info,
 ) -> None:
     """Serve the shaders over HTTP."""
+    from dataclasses import replace
+
+    from deepshade.bundles import bundle_root
     from deepshade.errors import ConfigError
-    from deepshade.exr import Limits
-    from deepshade_service.config import Settings
+    from deepshade_service.config import Settings, default_limits
     from deepshade_service.memory import parse_size
 
+    models = models or bundle_root()
     if not models.is_dir():
         raise ConfigError(
             "models", detail=f"there is no folder {models}; --models says where the bundles are"
@@ -56,10 +81,16 @@ def serve(
         "parts": max_parts,
         "channels": max_channels,
     }
+    uploads = parse_size(max_uploads) if max_uploads else 0
     chosen = {"threads": threads, "memory": parse_size(memory) if memory else None}
     settings = Settings(
         models=models,
-        limits=Limits(**{name: value for name, value in limits.items() if value is not None}),
+        limits=replace(
+            default_limits(uploads),
+            **{name: value for name, value in limits.items() if value is not None},
+        ),
+        uploads=uploads,
+        files=max_files,
         workers=workers,
         queue=queue,
         body_timeout=body_timeout,

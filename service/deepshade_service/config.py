@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from deepshade.bundles import bundle_root
 from deepshade.errors import ConfigError
 from deepshade.exr import Limits
 from deepshade.machine import cpu_count, memory_bytes
@@ -18,32 +19,49 @@ def default_memory() -> int:
     return min(8 * GIB, max(256 * MIB, memory_bytes() // 2))
 
 
+def default_uploads() -> int:
+    """A quarter of what the machine or the container has, between 256 MiB and 4 GiB."""
+    return min(4 * GIB, max(256 * MIB, memory_bytes() // 4))
+
+
+def default_limits(uploads: int | None = None) -> Limits:
+    """The usual limits, but no body larger than half of `uploads`: it is held twice at first."""
+    return Limits(body_bytes=min(Limits().body_bytes, (uploads or default_uploads()) // 2))
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
     """Everything an operator can set. Sizes are bytes, times are seconds.
 
     `workers` requests are shaded at a time and `queue` more may wait; the next gets a 429.
     `memory` is what all requests together may use for pixels and networks, above the idle
-    service; tiles are cut to fit. `uploads` bounds the bodies held while they arrive and wait.
+    service; tiles are cut to fit. `uploads` bounds, besides, the bodies held while they arrive
+    (twice their bytes) and wait; 0 is the default for this machine, or what the largest body needs.
     """
 
-    models: Path = Path("models")
-    limits: Limits = field(default_factory=Limits)
+    models: Path = field(default_factory=bundle_root)
+    limits: Limits = field(default_factory=default_limits)
     threads: int = field(default_factory=cpu_count)
     workers: int = 2
     queue: int = 16
     memory: int = field(default_factory=default_memory)
-    uploads: int = 4 * GIB
+    uploads: int = 0
     files: int = 32
     body_timeout: float = 60.0
     idle_trim: float = 1.0
     grace: float = 20.0
 
     def __post_init__(self) -> None:
+        most = 2 * self.limits.body_bytes
+        if self.uploads == 0:
+            object.__setattr__(self, "uploads", max(default_uploads(), most))
         for key in ("threads", "workers", "memory", "uploads", "files"):
             _require(key, getattr(self, key) >= 1, "at least 1")
-        most = self.limits.body_bytes
-        _require("uploads", self.uploads >= most, f"at least the largest body, {most:,} bytes")
+        _require(
+            "uploads",
+            self.uploads >= most,
+            f"at least twice the largest body, {most:,} bytes (--max-uploads, --max-body)",
+        )
         _require("queue", self.queue >= 0, "0 or more")
         for key in ("body_timeout", "idle_trim", "grace"):
             _require(key, getattr(self, key) > 0, "more than 0 seconds")

@@ -54,24 +54,28 @@ class Job:
             if cancelled.is_set():
                 raise Cancelled
             try:
-                return self._shade(headers[0].parts[0], tile_bytes, watch, cancelled)
+                return self._shade(headers, tile_bytes, watch, cancelled)
             finally:
                 if needed > _BIG:
                     self.engine.shrink()
                     trim()
 
     def _shade(
-        self, part: exr.Part, tile_bytes: int, watch: Stopwatch, cancelled: threading.Event
+        self,
+        headers: list[exr.Header],
+        tile_bytes: int,
+        watch: Stopwatch,
+        cancelled: threading.Event,
     ) -> Answer:
         with watch.time("decode"):
-            gbuffer = shading.decode(self.files, self.engine, self.asked, self.limits)
+            gbuffer = shading.decode(self.files, headers, self.engine, self.asked, self.limits)
         with watch.time("plan"):
             plan = shading.plan(gbuffer, self.engine, self.asked, tile_bytes)
         with watch.time("infer"):
             shade = shading.infer(gbuffer, plan, self.engine, cancelled)
         with watch.time("encode"):
             facts = shading.describe(gbuffer, plan, self.engine)
-            content, media_type = shading.encode(shade, gbuffer, part, self.asked, facts)
+            content, media_type = shading.encode(shade, gbuffer, self.engine, self.asked, facts)
         return Answer(content, media_type, facts, gbuffer.background.size, watch)
 
     def _memory(self, headers: list[exr.Header]) -> tuple[int, int]:
@@ -80,12 +84,15 @@ class Job:
         Raises LimitError when the job would exceed the memory even with the smallest tiles.
         """
         bundle, per_pixel = self.engine.bundle, self.engine.bytes_per_pixel
-        width, height = max(part.shape[::-1] for header in headers for part in header.parts)
+        # any part may turn out to be the one that is shaded
+        height, width = max((p.shape for header in headers for p in header.parts), key=prod)
         # Throughout: the files, their channels as float32 with masks, the answer and its copies.
         pixel = 4 * self.engine.channels + 4 + 12 * len(bundle.outputs)
         held = sum(header.body_bytes for header in headers) + pixel * width * height
-        # First all channels as they are stored, and after that, in the same room, the network.
-        decoded = sum(header.decoded_bytes for header in headers)
+        # First all channels as they are stored, then what the inputs may be derived from, and
+        # after that, in the same room, the network.
+        sources = 4 * self.engine.channels * width * height
+        decoded = max(sources, sum(header.decoded_bytes for header in headers))
         multiple, halo = bundle.size_multiple, bundle.halo
         smallest = per_pixel * smallest_tile(height, width, multiple=multiple, halo=halo)
         least = held + max(decoded, smallest)

@@ -1,10 +1,16 @@
-"""Counts every response; plain ASGI, so that streaming bodies pass through untouched."""
+"""Plain ASGI around the application, so that streaming bodies pass through untouched."""
 
 from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from deepshade_service.telemetry import Telemetry
+
+# A refused body is thrown away for so long, in seconds, before its connection is closed.
+_LINGER = 1.0
 
 
 class Counting:
@@ -34,3 +40,53 @@ class Counting:
         except Exception:
             count(500)  # answered further out
             raise
+
+
+class Closing:
+    """Closes the connection of a request that is answered before its body has arrived.
+
+    Kept alive, the connection would first have to carry the rest of a body that nobody wants,
+    and the client would see the refusal only after that or a timeout. Closed at once, the unread
+    bytes would make the system reset it, and the client might lose the refusal. So the answer
+    goes out, what still arrives is thrown away for a moment, and then the connection is closed.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on."""
+        headers = dict(scope.get("headers", ()))
+        has_body = b"transfer-encoding" in headers or headers.get(b"content-length", b"0") != b"0"
+        if scope["type"] != "http" or not has_body:
+            await self._app(scope, receive, send)
+            return
+        arriving, refused = True, False
+
+        async def received() -> Message:
+            nonlocal arriving
+            message = await receive()
+            arriving = message["type"] == "http.request" and message.get("more_body", False)
+            return message
+
+        async def drain() -> None:
+            while arriving:
+                await received()
+
+        async def sent(message: Message) -> None:
+            nonlocal refused
+            if message["type"] == "http.response.start" and arriving:
+                # waiting once more for a body that was too slow, or for one that its client holds
+                # back until it is asked for, would be in vain
+                refused = message["status"] != 408 and b"expect" not in headers
+                others = [h for h in message["headers"] if h[0].lower() != b"connection"]
+                message = {**message, "headers": [*others, (b"connection", b"close")]}
+            elif refused and not message.get("more_body", False):
+                await send({**message, "more_body": True})
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(_LINGER):
+                        await drain()
+                message = {"type": "http.response.body", "body": b"", "more_body": False}
+            await send(message)
+
+        await self._app(scope, received, sent)

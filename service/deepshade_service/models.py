@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator
 from pathlib import Path
 
-from deepshade.bundles import Bundle
+from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS, Effect
 from deepshade.errors import nearest
 from deepshade_service.engine import Engine
@@ -27,8 +27,8 @@ class Models:
 
     def load(self) -> None:
         """Load and warm every bundle under the root; one that can't be used is left out, loudly."""
-        for path in sorted(self.root.glob("*/*/config.json")):
-            self._load_one(path.parent)
+        for folder in bundle_folders(self.root):
+            self._load_one(folder)
         self.ready = bool(self._engines)
         if not self.ready:
             log.error("no usable bundle under %s: the service stays unready", self.root)
@@ -48,7 +48,7 @@ class Models:
         log.info(
             "bundle %s (%s) is loaded, %d bytes a pixel",
             label,
-            bundle.sha256[:12],
+            bundle.short_hash,
             engine.bytes_per_pixel,
         )
 

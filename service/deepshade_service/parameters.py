@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from deepshade.channels import parse_mapping
+from deepshade.errors import ConfigError
 from deepshade.exr import COMPRESSIONS
 from deepshade.profiles import PROFILES
 
@@ -54,7 +56,10 @@ class ShadeParameters(BaseModel):
     ] = None
     format: Annotated[
         Literal["exr", "png"],
-        Field(description="`png` is 8-bit sRGB, for eyes; `exr` is linear, for work."),
+        Field(
+            description="`exr` is linear, for work; `png` is 8 bits, for eyes: sRGB for light,"
+            " the plain value for ao, which is a factor."
+        ),
     ] = "exr"
     compression: Annotated[Compression, Field(description="Of the EXR.")] = Compression("zip")
     half: Annotated[bool, Field(description="16-bit pixels in the EXR, else 32-bit.")] = True
@@ -62,13 +67,13 @@ class ShadeParameters(BaseModel):
     @field_validator("map")
     @classmethod
     def _check_map(cls, entries: list[str]) -> list[str]:
-        for entry in entries:
-            attribute, equals, channel = entry.partition("=")
-            if not (attribute and equals and channel):
-                raise ValueError(f"'{entry[:100]}' is not attribute=channel")
+        try:
+            parse_mapping(entries)
+        except ConfigError as error:
+            raise ValueError(str(error)) from None  # which names the parameter
         return entries
 
     @property
     def mapping(self) -> dict[str, str]:
         """`map` as attribute -> channel or layer."""
-        return {entry.partition("=")[0]: entry.partition("=")[2] for entry in self.map}
+        return parse_mapping(self.map)

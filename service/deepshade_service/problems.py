@@ -11,19 +11,19 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from deepshade.errors import (
-    AmbiguousChannelError,
-    BundleError,
-    CameraError,
-    ConfigError,
-    DamagedImageError,
-    DeepshadeError,
-    ImageError,
-    LimitError,
-    MissingAttributeError,
-)
+from deepshade.errors import DeepshadeError, LimitError
+from deepshade.problems import MEDIA_TYPE, facts_of, kind_of, type_uri
 
-MEDIA_TYPE = "application/problem+json"
+# Which option of `deepshade serve` sets a limit: what its operator can do about it.
+_OPTIONS = {
+    "body_bytes": "--max-body",
+    "decoded_bytes": "--max-decoded",
+    "pixels": "--max-pixels",
+    "parts": "--max-parts",
+    "channels": "--max-channels",
+    "files": "--max-files",
+    "memory_bytes": "--memory",
+}
 
 
 class Problem(Exception):
@@ -47,34 +47,21 @@ class Problem(Exception):
         self.more = {"fix": fix, **more} if fix else more
 
 
-# The first match counts, so subclasses come before their parents.
-_KINDS: tuple[tuple[type[DeepshadeError], int, str], ...] = (
-    (DamagedImageError, 400, "damaged-image"),
-    (ImageError, 400, "not-an-image"),
-    (LimitError, 413, "over-limit"),
-    (MissingAttributeError, 422, "missing-attribute"),
-    (AmbiguousChannelError, 422, "ambiguous-channel"),
-    (CameraError, 422, "no-camera"),
-    (ConfigError, 422, "bad-parameter"),
-    (BundleError, 500, "bad-bundle"),
-    (DeepshadeError, 422, "unusable-input"),
-)
-_FACTS = ("missing", "found", "near", "attribute", "candidates", "limit", "value", "maximum")
-_MOST = 200  # entries of a list; a file may have thousands of channels
-
-
 def from_error(error: DeepshadeError) -> Problem:
     """The problem that an error of the core package is, with the facts that it carries."""
-    status, kind = next((s, k) for cls, s, k in _KINDS if isinstance(error, cls))
-    facts = {name: _short(getattr(error, name)) for name in _FACTS if hasattr(error, name)}
-    return Problem(status, kind, str(error), fix=error.fix, **facts)
+    status, kind = kind_of(error)
+    fix = error.fix
+    if isinstance(error, LimitError) and error.limit in _OPTIONS:
+        option = _OPTIONS[error.limit]
+        fix = f"send a smaller picture, or start the service with a higher {option}"
+    return Problem(status, kind, str(error), fix=fix, **facts_of(error))
 
 
 def respond(problem: Problem) -> JSONResponse:
     """The problem as a response."""
     return JSONResponse(
         {
-            "type": f"urn:deepshade:problem:{problem.kind}",
+            "type": type_uri(problem.kind),
             "title": HTTPStatus(problem.status).phrase,
             "status": problem.status,
             "detail": problem.detail,
@@ -130,11 +117,3 @@ def install(app: FastAPI) -> None:
                 fix="report it with the request that caused it",
             )
         )
-
-
-def _short(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {name: _short(entry) for name, entry in list(value.items())[:_MOST]}
-    if isinstance(value, tuple | list | set):
-        return [str(entry)[:200] for entry in list(value)[:_MOST]]
-    return value

@@ -39,9 +39,15 @@ class Plan:
 
 
 def decode(
-    files: Sequence[Upload], engine: Engine, asked: ShadeParameters, limits: exr.Limits
+    files: Sequence[Upload],
+    headers: Sequence[exr.Header],
+    engine: Engine,
+    asked: ShadeParameters,
+    limits: exr.Limits,
 ) -> GBuffer:
     """The G-buffer that the engine's network needs, found or derived in the files.
+
+    `headers` are the files' own, read before.
 
     Raises what `load_gbuffer` raises.
     """
@@ -52,6 +58,7 @@ def decode(
         mapping=asked.mapping,
         fov=asked.fov,
         limits=limits,
+        headers=headers,
     )
 
 
@@ -110,15 +117,19 @@ def infer(gbuffer: GBuffer, plan: Plan, engine: Engine, cancelled: threading.Eve
 
 
 def encode(
-    shade: Float, gbuffer: GBuffer, part: exr.Part, asked: ShadeParameters, facts: Facts
+    shade: Float, gbuffer: GBuffer, engine: Engine, asked: ShadeParameters, facts: Facts
 ) -> tuple[bytes, str]:
-    """The answer's bytes and media type. `part` gives the windows; `facts` go into the header."""
+    """The answer's bytes and media type; it has the G-buffer's windows, and `facts` in its header.
+
+    The frame starts at (0, 0), whatever the display window's corner was.
+    """
     if asked.format == "png":
-        return pictures.png(pictures.srgb(shade)), "image/png"
+        picture = pictures.of_effect(shade, EFFECTS[engine.bundle.effect])
+        return pictures.png(picture), "image/png"
     outputs = "Y" if len(shade) == 1 else "RGB"
     attributes: dict[str, Any] = gbuffer.camera.to_header() if gbuffer.camera else {}
     attributes |= {f"deepshade:{name}": value for name, value in facts.items()}
-    (x0, y0, *_), (left, top, right, bottom) = part.data_window, part.display_window
+    (x0, y0, *_), (left, top, right, bottom) = gbuffer.data_window, gbuffer.display_window
     stream = io.BytesIO()
     exr.write(
         stream,

@@ -50,18 +50,6 @@ class Tiling:
     def __iter__(self) -> Iterator[Tile]:
         return (Tile(rows, columns) for rows in self.rows for columns in self.columns)
 
-    @property
-    def computed(self) -> int:
-        """Pixels that the network computes, overlaps and padding included."""
-        return _length(self.rows) * _length(self.columns)
-
-    @property
-    def largest(self) -> int:
-        """Pixels of the largest tile."""
-        return max(s.stop - s.start for s in self.rows) * max(
-            s.stop - s.start for s in self.columns
-        )
-
 
 def plan_tiles(height: int, width: int, *, multiple: int, halo: int, max_pixels: int) -> Tiling:
     """The tiling with the fewest computed pixels whose tiles have at most `max_pixels`.
@@ -129,10 +117,6 @@ def _fewest_cuts(length: int, multiple: int, halo: int, longest: int) -> int | N
         return 2
     room = (longest - 2 * halo) // multiple * multiple
     return math.ceil(length / room) if room > 0 else None
-
-
-def _length(spans: tuple[Span, ...]) -> int:
-    return sum(span.stop - span.start for span in spans)
 
 
 def _least(multiple: int, halo: int) -> int:

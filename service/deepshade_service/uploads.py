@@ -1,7 +1,8 @@
 """Receiving a request's EXR files: one raw body, or the files of a multipart form.
 
 A body is received completely before anything waits for a worker, so a slow client holds nothing
-but its own bytes, and those are limited three ways: for each request, in time, and in sum.
+but its own bytes, and those are limited three ways: for each request, in time, and in sum. In
+the sum a body counts twice while it arrives, because joining its pieces needs that much.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from deepshade.errors import LimitError
-from deepshade.profiles import QUANTITIES
+from deepshade.gbuffer import source_name
 from deepshade_service.config import Settings
 from deepshade_service.problems import Problem
 
@@ -39,7 +40,7 @@ class Upload:
     @property
     def name(self) -> str:
         """What the file is called: its field if that names an attribute, else its file name."""
-        return f"{self.field}.exr" if self.field in QUANTITIES else self.filename
+        return source_name(self.field, self.filename)
 
 
 class Uploads:
@@ -74,9 +75,11 @@ class Uploads:
                 )
             else:
                 reading = _read_raw(body.chunks(request))
-            yield await self._in_time(reading)
+            files = await self._in_time(reading)
+            body.joined()
+            yield files
         finally:
-            self.held -= body.size
+            self.held -= body.held
 
     async def _in_time(self, reading: Awaitable[list[Upload]]) -> list[Upload]:
         try:
@@ -87,7 +90,6 @@ class Uploads:
                 408,
                 "too-slow",
                 f"the body did not arrive within {self._settings.body_timeout:g} s",
-                headers={"Connection": "close"},
             ) from None
 
 
@@ -99,6 +101,7 @@ class _Body:
     limit: int
     room: int
     size: int = 0
+    held: int = 0
 
     async def chunks(self, request: Request) -> AsyncIterator[bytes]:
         declared = request.headers.get("content-length", "")
@@ -106,13 +109,21 @@ class _Body:
         async for chunk in request.stream():
             self._check(self.size + len(chunk), len(chunk))
             self.size += len(chunk)
-            self.uploads.held += len(chunk)
+            self._hold(2 * self.size)
             yield chunk
+
+    def joined(self) -> None:
+        """Its pieces are one, and gone."""
+        self._hold(self.size)
+
+    def _hold(self, amount: int) -> None:
+        self.uploads.held += amount - self.held
+        self.held = amount
 
     def _check(self, size: int, more: int) -> None:
         if size > self.limit:
             raise LimitError("body_bytes", size, self.limit)
-        if self.uploads.held + max(more, size - self.size) > self.room:
+        if self.uploads.held + 2 * max(more, size - self.size) > self.room:
             raise Problem(
                 429,
                 "uploads-full",

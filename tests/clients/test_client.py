@@ -18,6 +18,7 @@ from deepshade_client import (
     Busy,
     Client,
     ClientError,
+    ConnectionBroken,
     ConnectionFailed,
     MissingAttribute,
     MockTransport,
@@ -49,8 +50,8 @@ def test_public_names():
     """What users may import: exactly this, each documented."""
     names = {
         "AsyncClient Client Answer Options MockTransport Retry NO_RETRY Timeout ClientError",
-        "TransportError ConnectionFailed TimedOut ServerProblem BadRequest MissingAttribute",
-        "TooLarge Busy NotReady ServerFailed BadAnswer",
+        "TransportError ConnectionBroken ConnectionFailed TimedOut ServerProblem BadRequest",
+        "MissingAttribute TooLarge Busy NotReady ServerFailed BadAnswer",
     }
     expected = {name for line in names for name in line.split()}
     assert set(deepshade_client.__all__) == expected
@@ -184,7 +185,7 @@ def test_mock_transport(make_exr):
             client.shade("aoo", b"")
         assert client.effect("ao")["bundles"][0]["name"] == "mock"
         assert client.effects()[0]["name"] == "ao"
-    assert answer.facts["radius"] == "2.0"
+    assert answer.facts["radius"] == "2"
     assert answer.channels()["Y"].shape == (4, 6)
     assert (answer.channels()["Y"] > 0.1).all()
     np.testing.assert_array_equal(several.channels()["Y"], answer.channels()["Y"])
@@ -195,6 +196,48 @@ def test_mock_transport(make_exr):
             return await client.shade("ao", make_exr(4, 6), Options(radius=2))
 
     assert asyncio.run(work()).content == answer.content
+
+
+def test_the_mock_answers_as_the_service_does(server, make_exr, make_picture):
+    """The same requests, to both: kinds of answers, statuses and kinds of problems."""
+    channels = make_picture(8, 8)
+    split = {
+        name: make_exr({k[-1]: v for k, v in channels.items() if name in k})
+        for name in ("normal", "position")
+    }
+    requests = [
+        (make_exr(8, 8), Options()),
+        (make_exr(8, 8), Options(format="png")),
+        (split, Options()),  # names of form fields say what the files hold
+        (b"hello", Options()),
+        (make_exr(8, 8)[:-20], Options()),
+        (make_exr({"A": channels["normal.X"]}), Options()),
+        (make_exr(8, 8), Options(radius=-1)),
+        (make_exr(8, 8), Options(fov=200)),
+        (make_exr(8, 8), Options(mapping={"nromal": "x"})),
+        (make_exr(8, 8), Options(mapping={"": "x"})),
+        (make_exr({"Z": 1 - channels["position.Z"]}), Options()),
+    ]
+
+    def outcome(client, picture, options):
+        try:
+            answer = client.shade("ao", picture, options)
+        except BadRequest as error:
+            return error.status, error.kind
+        return answer.media_type, answer.facts["effect"]
+
+    mock = MockTransport(lambda gbuffer: 0.5 * gbuffer.attributes["normal"][2])
+    with Client(transport=mock) as one, Client(server, retry=NO_RETRY) as other:
+        for picture, options in requests:
+            assert outcome(one, picture, options) == outcome(other, picture, options), options
+
+
+@pytest.mark.parametrize("server", ["http://a:b", "127.0.0.1:8000", "ftp://x", "", "http://"])
+def test_what_is_no_address(server, monkeypatch):
+    monkeypatch.setenv("DEEPSHADE_SERVER", "http://")
+    with pytest.raises(ClientError, match="no address") as caught:
+        Client(server)
+    assert "http://127.0.0.1:8000" in caught.value.fix
 
 
 class Script(httpx.BaseTransport, httpx.AsyncBaseTransport):
@@ -288,9 +331,10 @@ def test_pauses_grow_honour_retry_after_and_are_capped():
     for attempt, pause in enumerate(pauses[:4]):
         assert 2**attempt <= pause <= 1.25 * 2**attempt
     assert pauses[-1] == 20
+    assert retry.pause(Busy(429, {}, retry_after=60), 1) == 60  # not cut to our own longest
     assert retry.pause(Busy(429, {}), 10) is None
-    assert 7 <= retry.pause(Busy(429, {}, retry_after=7), 1) <= 8.75
-    assert retry.pause(Busy(429, {}, retry_after=10_000), 1) == 20
+    assert retry.pause(Busy(429, {}, retry_after=7), 1) == 7
+    assert retry.pause(Busy(429, {}, retry_after=10_000), 1) == 300
     assert retry.pause(BadRequest(400, {}), 1) is None
 
 
@@ -302,6 +346,23 @@ def test_retry_after_as_a_date():
     with Client(transport=script, retry=NO_RETRY) as client, pytest.raises(Busy) as caught:
         client.effects()
     assert 25 < caught.value.retry_after <= 31
+
+
+def test_a_broken_connection_stops_no_batch(make_exr, tmp_path):
+    from deepshade_client import batch
+
+    (tmp_path / "a.exr").write_bytes(make_exr(4, 4))
+    tasks = [batch.Task((tmp_path / "a.exr",), tmp_path / f"{n}.exr") for n in range(3)]
+    found = httpx.Response(200, content=b"x", headers={"Content-Type": "image/x-exr"})
+
+    async def work(failure):
+        script = Script(failure, found, found)
+        async with AsyncClient(transport=script, retry=NO_RETRY) as client:
+            return await batch.run(client, "ao", tasks, Options(), jobs=1, done=lambda result: None)
+
+    results = asyncio.run(work(httpx.ReadError("reset")))
+    assert [type(result.error) for result in results] == [ConnectionBroken, type(None), type(None)]
+    assert len(asyncio.run(work(httpx.ConnectError("refused")))) == 1
 
 
 def test_nobody_listens():

@@ -248,3 +248,9 @@ def test_imports_core_only():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_wrong_address_and_a_wrong_mapping_are_no_tracebacks(run, views, tmp_path):
+    assert "no address" in run("effects", "--server", "http://a:b", code=2)[1]
+    arguments = ["shade", "ao", views / "a.exr", "-o", tmp_path / "x.exr", "--map", "normal"]
+    assert "'normal' is no attribute=channel pair" in run(*arguments, code=2)[1]

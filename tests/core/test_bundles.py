@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from deepshade.bundles import Bundle, config_of, find_bundles, write_config
+from deepshade.bundles import Bundle, bundle_folders, bundle_root, write_config
 from deepshade.errors import BundleError
 
 
@@ -48,17 +48,29 @@ def test_round_trip(folder):
     assert loaded.position_scale == "1/radius"
     assert (loaded.input_name, loaded.output_name) == ("gbuffer", "shade")
     assert loaded.hashes["model.onnx"] == hashlib.sha256(b"graph").hexdigest()
-    assert loaded.sha256 == hashlib.sha256(b"graph").hexdigest()[:12]
+    assert loaded.sha256 == hashlib.sha256(b"graph").hexdigest()
+    assert loaded.short_hash == loaded.sha256[:12]
     assert loaded.metrics == {"dssim": 0.1}
-    assert json.loads((folder / "config.json").read_text()) == json.loads(
-        json.dumps(config_of(loaded))
-    )
-    assert find_bundles(folder.parents[1]) == [loaded]
+    config = json.loads((folder / "config.json").read_text())
+    assert config["hashes"] == loaded.hashes
+    assert config["ranges"] == {"position": [-40.0, 40.0]}
+    assert bundle_folders(folder.parents[1]) == [folder]
     assert not [p for p in folder.iterdir() if p.name.endswith(".tmp")]
 
 
 def test_no_folder_holds_no_bundles(tmp_path):
-    assert find_bundles(tmp_path / "nowhere") == []
+    assert bundle_folders(tmp_path / "nowhere") == []
+
+
+def test_where_models_are(tmp_path, monkeypatch):
+    monkeypatch.delenv("DEEPSHADE_MODELS", raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert bundle_root().parts[-1] == "models"
+    assert (bundle_root().parent / "core").is_dir()
+    (tmp_path / "models").mkdir()
+    assert bundle_root().resolve() == tmp_path / "models"
+    monkeypatch.setenv("DEEPSHADE_MODELS", "/elsewhere")
+    assert str(bundle_root()) == "/elsewhere"
 
 
 @pytest.mark.parametrize("name", ["model.onnx", "model.safetensors"])
@@ -88,6 +100,8 @@ def test_unknown_entries_name_the_nearest(folder):
         {"radius": True},
         {"fov": 180},
         {"effect": "oa"},
+        {"effect": ["ao"]},
+        {"radius": 10**400},
         {"inputs": ["normals"]},
         {"inputs": []},
         {"outputs": ["Y", "Y"]},

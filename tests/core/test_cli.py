@@ -82,6 +82,15 @@ def test_interrupts_and_exit_codes(commands):
     assert cli.main(["three"]) == 3
 
 
+def test_a_path_that_cannot_be_written_is_no_traceback(commands, capsys):
+    def write() -> None:
+        open("/proc/nowhere/x.exr", "w")  # noqa: PTH123, SIM115
+
+    commands(write=write)
+    assert cli.main(["write"]) == 2
+    assert capsys.readouterr().err == "error: /proc/nowhere/x.exr: No such file or directory\n"
+
+
 def test_usage_errors(capsys):
     assert cli.main(["insepct"]) == 2
     assert "Did you mean 'inspect'?" in capsys.readouterr().err

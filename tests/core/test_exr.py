@@ -37,6 +37,25 @@ def window(x0, y0, x1, y1):
     return np.array([x0, y0], np.int32), np.array([x1, y1], np.int32)
 
 
+def test_attributes_are_counted_over_all_parts():
+    """Each part has fewer than a file may have; together they have more."""
+    many = {f"a{n}": 1 for n in range(2500)}
+    made = [
+        OpenEXR.Part({"type": OpenEXR.scanlineimage, **many}, {"Z": plane(1, 1)}, name)
+        for name in ("one", "two")
+    ]
+    assert len(exr.read_header(by_openexr(made[:1])).parts[0].attributes) > 2500
+    with pytest.raises(ImageError, match="over 4,000 attributes"):
+        exr.read_header(by_openexr(made))
+
+
+def test_texts_in_one_attribute_are_counted():
+    body = encode({"Z": plane(1, 1)})
+    texts = b"x\0stringvector\0" + struct.pack("<i", 4 * 5000) + bytes(4 * 5000)
+    with pytest.raises(DamagedImageError, match="stringvector"):
+        exr.read_header(body[:8] + texts + body[8:])
+
+
 @pytest.mark.parametrize("compression", LOSSLESS)
 @pytest.mark.parametrize("half", [False, True, ["b"]])
 def test_round_trip(compression, half):

@@ -318,6 +318,108 @@ def test_files_must_cover_the_same_pixels():
         load_gbuffer(shifted, NEEDS)
 
 
+def parted(*parts):
+    """A multi-part EXR of (name, channels, x0, y0), written by OpenEXR itself."""
+    made = []
+    for name, planes, x0, y0 in parts:
+        height, width = next(iter(planes.values())).shape
+        made.append(
+            OpenEXR.Part(
+                {
+                    "type": OpenEXR.scanlineimage,
+                    "compression": OpenEXR.ZIP_COMPRESSION,
+                    "dataWindow": (
+                        np.int32([x0, y0]),
+                        np.int32([x0 + width - 1, y0 + height - 1]),
+                    ),
+                    "displayWindow": (np.int32([0, 0]), np.int32([W - 1, H - 1])),
+                },
+                {key: np.ascontiguousarray(plane) for key, plane in planes.items()},
+                name,
+            )
+        )
+    body = io.BytesIO()
+    with OpenEXR.File(made) as file:
+        file.write(body)
+    return body.getvalue()
+
+
+def test_markers_of_other_pixels_are_passed_over():
+    """An auto-cropped RGBA part says nothing about the pixels of the data part."""
+    small = dict.fromkeys("RGBA", np.zeros((8, 8), "f"))
+    data = layer("normal", N) | layer("position", P)
+    body = parted(("beauty", small, 5, 6), ("data", data, 0, 0))
+    gbuffer = load_gbuffer(body, NEEDS)
+    check(gbuffer, atol=0)
+    assert "alpha" not in gbuffer.mapped
+    assert gbuffer.data_window == (0, 0, W - 1, H - 1)
+    with pytest.raises(ImageError, match="cover different pixels"):
+        load_gbuffer(body, NEEDS, mapping={"alpha": "A"})
+
+
+def test_windows_and_camera_are_those_of_the_data():
+    small = {"A": np.ones((8, 8), "f")}
+    crop = {name: plane[4:20, 8:40] for name, plane in layer("normal", N).items()}
+    crop["Z"] = Z[4:20, 8:40]
+    body = parted(("beauty", small, 5, 6), ("data", crop, 8, 4))
+    gbuffer = load_gbuffer(body, NEEDS, fov=50)
+    assert gbuffer.data_window == (8, 4, 39, 19)
+    assert gbuffer.display_window == (0, 0, W - 1, H - 1)
+    np.testing.assert_allclose(gbuffer.attributes["position"], P[:, 4:20, 8:40], atol=1e-4)
+
+
+def test_attributes_that_share_channels_keep_their_own_signs():
+    """RenderMan's Nn has z into the screen; the same channels as colours have no such sign."""
+    stored = N * np.float32([[[1]], [[1]], [[-1]]])
+    body = encode(layer("Nn", stored) | layer("position", P))
+    both = load_gbuffer(
+        body, ("normal", "light"), profile="renderman", mapping={"normal": "Nn", "light": "Nn"}
+    )
+    np.testing.assert_allclose(both.attributes["normal"], N, atol=1e-6)
+    np.testing.assert_allclose(both.attributes["light"], stored, atol=1e-6)
+
+
+def test_pixels_need_not_be_square():
+    """Squeezed to half its width, a picture gives the positions of every second column."""
+    aspect = encode(
+        {"Z": Z[:, ::2], **layer("normal", N[:, :, ::2])},
+        {"deepshade:fov": 50.0, "pixelAspectRatio": 2.0},
+    )
+    gbuffer = load_gbuffer(aspect, NEEDS)
+    rays = Camera(50, W, H).rays()
+    expected = (rays[:, :, ::2] + rays[:, :, 1::2]) / 2 * np.where(HIT, Z, 0)[:, ::2]
+    np.testing.assert_allclose(gbuffer.attributes["position"], expected, atol=1e-4)
+    assert gbuffer.camera.to_header()["pixelAspectRatio"] == 2
+
+
+def test_world_positions_take_little_memory():
+    import tracemalloc
+
+    from deepshade import derivation
+
+    points = np.ones((3, 512, 1024), "f")
+    source = derivation.Source({"position_world": points}, points[0] > 0, matrix=CAMERA.matrix)
+    (step,) = (s for s in derivation.steps_to("position") if s.needs == ("position_world",))
+    tracemalloc.start()
+    step.function(source)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 25 * 512 * 1024  # 12 bytes a pixel are the answer
+
+
+def test_hints_for_very_many_very_long_names_are_quick():
+    import time
+
+    rng = np.random.default_rng(0)
+    letters = np.array(list("positnrmal_."))
+    names = ["".join(rng.choice(letters, 245)) + f"x{n}" for n in range(1000)]
+    body = encode({**{name: np.ones((1, 1), "f") for name in names}, "positon.Q": np.ones((1, 1))})
+    start = time.process_time()
+    with pytest.raises(MissingAttributeError):
+        load_gbuffer(body, NEEDS)
+    assert time.process_time() - start < 1.5
+
+
 def test_limits_count_all_files_together():
     body = encode({"Z": Z})
     with pytest.raises(LimitError):

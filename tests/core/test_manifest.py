@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from deepshade.errors import DataError
-from deepshade.manifest import NAME, Manifest, Shard, sha256, shard_path
+from deepshade.files import sha256
+from deepshade.manifest import NAME, Manifest, Shard, shard_path
 
 
 def example() -> Manifest:
@@ -71,3 +72,17 @@ def test_names_cannot_leave_the_folder(tmp_path: Path) -> None:
 def test_sha256_of_known_bytes(tmp_path: Path) -> None:
     (tmp_path / "abc").write_bytes(b"abc")
     assert sha256(tmp_path / "abc").startswith("ba7816bf8f01cfea414140de5dae2223")
+
+
+def test_a_replaced_file_is_synced_with_its_folder(tmp_path: Path, monkeypatch) -> None:
+    import os
+    import stat
+
+    from deepshade.files import replacing
+
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda d: synced.append(stat.S_ISDIR(os.fstat(d).st_mode)))
+    with replacing(tmp_path / "a") as temporary:
+        temporary.write_bytes(b"x")
+    assert synced == [False, True]
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]

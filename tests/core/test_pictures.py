@@ -12,6 +12,14 @@ from PIL import Image
 from deepshade import pictures
 
 
+def test_each_effect_says_how_it_is_shown() -> None:
+    from deepshade.effects import EFFECTS
+
+    image = np.array([[0.5]])
+    assert pictures.of_effect(image, EFFECTS["ao"])[0, 0, 0] == 128
+    assert pictures.of_effect(image, EFFECTS["gi"])[0, 0, 0] == 188
+
+
 def test_srgb_at_known_values() -> None:
     # IEC 61966-2-1: 0.5 linear is 188, the toe is linear, the ends are the ends.
     image = np.array([[0.0, 0.0031308, 0.5, 1.0, 7.0, np.nan]], np.float32)

@@ -106,7 +106,7 @@ def test_match_rank(layer, alias, stem, rank):
 def test_errors_say_what_and_what_to_do():
     limit = LimitError("pixels", 10_000, 100)
     assert "10,000 pixels" in str(limit)
-    assert "'pixels'" in limit.fix
+    assert "Limits(pixels" in limit.fix
     missing = MissingAttributeError(["normal"], ["Nornal.X"], {"normal": ("Nornal",)})
     assert "'normal'" in str(missing)
     assert "Nornal.X" in str(missing)

@@ -401,6 +401,27 @@ def forms() -> Iterator[Upload]:
         yield Upload(f"form: {name}", data, kind="multipart/form-data; boundary=X")
 
 
+def many_names() -> Iterator[Upload]:
+    """What only the usual limits let through: very many channels, attributes, parts."""
+    letters = np.array(list("positnrmal_."))
+    rng = np.random.default_rng(0)
+    names = ["".join(rng.choice(letters, 245)) + f"x{n}" for n in range(1024)]
+    yield Upload("1,024 channels with long names", good(1, 1, names=names, dtype=np.float32))
+    tiny = b"".join(attribute(b"a%d" % n, b"int", bytes(4)) for n in range(19_000))
+    named = (
+        attribute(b"name", b"string", b"p%d" % i)
+        + attribute(b"type", b"string", b"scanlineimage")
+        + attribute(b"chunkCount", b"int", struct.pack("<i", 2))
+        + tiny
+        + header()
+        for i in range(64)
+    )
+    flags = struct.pack("<I", 2 | 0x1000)
+    yield Upload("64 x 19,000 attributes", MAGIC + flags + b"".join(named) + b"\0" + bytes(1024))
+    texts = attribute(b"x", b"stringvector", bytes(4 * 5_000_000))
+    yield Upload("5,000,000 empty texts", image(texts + header()))
+
+
 GROUPS = (
     truncations,
     flips,
@@ -413,6 +434,18 @@ GROUPS = (
     others,
     forms,
 )
+
+
+@pytest.mark.slow
+def test_hostile_uploads_at_the_usual_limits(start):
+    local = start()
+    for upload in many_names():
+        start_time = time.monotonic()
+        response = local.client.post(
+            "/shade/ao", content=upload.body, headers={"Content-Type": upload.kind}
+        )
+        assert time.monotonic() - start_time < 2, upload.name
+        assert 400 <= response.status_code < 500, upload.name
 
 
 @pytest.mark.slow

@@ -84,3 +84,63 @@ def test_an_idle_service_gives_its_memory_back(start, make_exr):
         time.sleep(0.01)
     time.sleep(0.3)
     assert len(calls) == 1  # once, not again and again
+
+
+def test_the_part_with_the_most_pixels_counts(service, make_exr):
+    """Not the widest one: either may turn out to be the one that is shaded."""
+    from deepshade import exr
+    from deepshade_service.job import Job
+    from deepshade_service.memory import MemoryBudget
+    from deepshade_service.parameters import ShadeParameters
+
+    engine = service.service.models.pick("ao")
+    job = Job(engine, [], ShadeParameters(), exr.Limits(), MemoryBudget(2**30))
+    wide, large = (exr.read_header(make_exr(*size)) for size in ((1, 101), (100, 100)))
+    needed, _ = job._memory([large])
+    together, tile = job._memory([wide, large])
+    assert together > needed
+    assert tile >= engine.bytes_per_pixel * 100 * 100
+
+
+def test_uploads_fit_the_machine(monkeypatch):
+    from deepshade.errors import ConfigError
+    from deepshade.exr import Limits
+    from deepshade_service import config
+
+    monkeypatch.setattr(config, "memory_bytes", lambda: 2 * config.GIB)
+    small = config.Settings()
+    assert small.uploads == config.GIB // 2
+    assert small.limits.body_bytes == config.GIB // 4
+    assert config.Settings(limits=Limits(body_bytes=5 * config.GIB)).uploads == 10 * config.GIB
+    with pytest.raises(ConfigError, match="--max-uploads"):
+        config.Settings(uploads=1000, limits=Limits(body_bytes=501))
+
+
+def test_what_a_derivation_takes_is_counted(service, make_exr, make_picture, monkeypatch):
+    """World-space attributes as half floats: read, converted, and beside them what they give."""
+    import tracemalloc
+
+    import numpy as np
+
+    from deepshade import exr
+    from deepshade.gbuffer import load_gbuffer
+    from deepshade_service.job import Job
+    from deepshade_service.memory import MemoryBudget
+    from deepshade_service.parameters import ShadeParameters
+
+    channels = {
+        name.replace(".", "_world."): plane for name, plane in make_picture(512, 512).items()
+    }
+    body = make_exr(
+        channels, half=True, compression="none", attributes={"worldToCamera": np.eye(4)}
+    )
+    header = exr.read_header(body)
+    engine = service.service.models.pick("ao")
+    monkeypatch.setattr(engine, "bytes_per_pixel", 1)  # as if the network took nothing
+    job = Job(engine, [], ShadeParameters(), exr.Limits(), MemoryBudget(2**30))
+    needed, _ = job._memory([header])
+    tracemalloc.start()
+    load_gbuffer(body, ("normal", "position"), headers=[header])
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak <= needed - len(body)

@@ -121,6 +121,7 @@ def test_limits(start, make_exr, limit, value):
     local = start(limits=Limits(**{limit: value}))
     document = problem(shade(local.client, make_exr(16, 16)), 413, "over-limit")
     assert document["limit"] == limit
+    assert f"--max-{limit.removesuffix('_bytes')}" in document["fix"]
     assert document["maximum"] == value
     assert document["value"] > value
 
@@ -151,10 +152,29 @@ def test_declared_length_over_the_limit_is_refused_before_the_body(start):
         assert b"413" in connection.recv(100)
 
 
+def test_a_refusal_reaches_a_client_that_is_still_sending(start, make_exr):
+    local = start(limits=Limits(body_bytes=2**20), queue=0, workers=1)
+    big = bytes(16 * 2**20)
+    start_time = time.monotonic()
+    for _ in range(3):
+        response = shade(local.client, big)
+        problem(response, 413, "over-limit")
+        assert response.headers["connection"] == "close"
+    problem(shade(local.client, big, effect="aoo"), 404, "unknown-effect")
+    response = local.client.post("/shade/ao", content=big, headers={"Content-Type": "text/plain"})
+    problem(response, 415, "unsupported-type")
+    assert time.monotonic() - start_time < 4  # kept alive, each takes five seconds
+    response = shade(local.client, make_exr(8, 8))
+    assert response.status_code == 200
+    assert "connection" not in response.headers
+    # the body has arrived: nothing is in the way, the connection stays
+    assert "connection" not in shade(local.client, b"hello").headers
+
+
 def test_sum_of_uploads_is_limited(start, make_exr):
     body = make_exr(64, 64)
-    room = len(body) + 100
-    local = start(uploads=room, limits=Limits(body_bytes=room))
+    room = 2 * len(body) + 100  # a body is held twice while its pieces are joined
+    local = start(uploads=room, limits=Limits(body_bytes=len(body)))
     with socket.create_connection(local.address, timeout=5) as connection:
         connection.sendall(
             b"POST /shade/ao HTTP/1.1\r\nHost: x\r\nContent-Type: image/x-exr\r\n"
@@ -177,6 +197,7 @@ def test_too_large_for_the_memory(start, make_exr):
     local = start(memory=200_000)
     document = problem(shade(local.client, make_exr(128, 128)), 413, "over-limit")
     assert document["limit"] == "memory_bytes"
+    assert "--memory" in document["fix"]
     assert shade(local.client, make_exr(8, 8)).status_code == 200
 
 

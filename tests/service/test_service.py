@@ -136,3 +136,19 @@ def test_serve_without_models_folder_is_a_usage_error(tmp_path):
     assert done.returncode == 2
     assert "there is no folder" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--log-level", "foo"], "'foo'"),
+        (["--max-uploads", "1M", "--max-body", "1M"], "--max-uploads"),
+        (["--models", "/nowhere"], "/nowhere"),
+        (["--max-body", "much"], "'much'"),
+    ],
+)
+def test_wrong_options_are_no_tracebacks(models, capsys, options, message):
+    from deepshade.cli import main
+
+    assert main(["serve", "--models", str(models), *options]) == 2
+    assert message in capsys.readouterr().err

@@ -20,7 +20,8 @@ from safetensors.numpy import load_file
 
 from deepshade.camera import Camera
 from deepshade.errors import ConfigError, DataError, SceneError
-from deepshade.manifest import Manifest, sha256
+from deepshade.files import sha256
+from deepshade.manifest import Manifest
 from deepshade_workers.datagen import Job, expand_scenes, generate, make_sample, make_shard
 from deepshade_workers.loading import open_scene
 from deepshade_workers.procedural import FAMILIES

@@ -19,7 +19,8 @@ from torch import Tensor
 from deepshade import symmetry
 from deepshade.effects import EFFECTS
 from deepshade.errors import DataError
-from deepshade.manifest import Manifest, sha256, shard_path
+from deepshade.files import sha256
+from deepshade.manifest import Manifest, shard_path
 
 Sample = dict[str, NDArray[np.float32]]
 
