@@ -157,7 +157,7 @@ def _logging(level: str) -> dict[str, Any]:
     from uvicorn.config import LOGGING_CONFIG
 
     logging = deepcopy(LOGGING_CONFIG)
-    for name in ("uvicorn", "uvicorn.access", "deepshade"):
+    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "deepshade"):
         logging["loggers"].setdefault(name, {"handlers": ["default"], "propagate": False})
         logging["loggers"][name]["level"] = level.upper()
     return logging
