@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -307,12 +308,20 @@ def _connect(address: str | None) -> None:
     if where == "local":
         options |= {"include_dashboard": False}
     try:
+        _knock(where)
         ray.init(address=where, **options)
-    except ConnectionError as error:
+    except (ConnectionError, OSError) as error:
         raise DataError(
             f"there is no Ray cluster at {where}: {error}",
             fix="start one with 'ray start --head', or leave --address out",
         ) from error
+
+
+def _knock(address: str) -> None:
+    """Raise OSError if nothing listens at host:port; Ray itself would try for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
 
 
 def _resources() -> dict[str, float]:
