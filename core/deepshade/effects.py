@@ -27,11 +27,6 @@ class Effect:
     reference: str
     picture: Literal["linear", "srgb"] = "srgb"
 
-    @property
-    def input_channels(self) -> tuple[str, ...]:
-        """Canonical channel names of all inputs, in network order."""
-        return tuple(channel for name in self.inputs for channel in ATTRIBUTES[name].channels)
-
 
 _Y = ("Y",)
 _RGB = ("R", "G", "B")

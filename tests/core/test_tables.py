@@ -44,7 +44,7 @@ def test_effects_use_known_attributes_and_outputs():
         assert effect.outputs in (("Y",), ("R", "G", "B"))
     assert EFFECTS["ao"].inputs == ("normal", "position")
     assert EFFECTS["ao"].background == 1.0
-    assert EFFECTS["ao"].input_channels[3] == "position.X"
+    assert ATTRIBUTES[EFFECTS["ao"].inputs[1]].channels[0] == "position.X"
     assert [e.name for e in EFFECTS.values() if e.per_channel] == ["gi", "sss", "dof", "mb", "aa"]
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -42,7 +43,7 @@ class NetworkConfig:
     position: int | None = 3
 
 
-class Shader(nn.Module):
+class Shader(nn.Module, ABC):
     """Base of all networks: finds the background and keeps it at `background`."""
 
     def __init__(self, config: NetworkConfig, background: float) -> None:
@@ -51,13 +52,13 @@ class Shader(nn.Module):
         self.background = background
 
     @property
+    @abstractmethod
     def size_multiple(self) -> int:
         """Height and width must be multiples of this many pixels."""
-        raise NotImplementedError
 
+    @abstractmethod
     def needs(self, pixel: int) -> Span:
         """The input columns that the output column `pixel` depends on (rows are alike)."""
-        raise NotImplementedError
 
     @property
     def halo(self) -> int:
@@ -68,9 +69,9 @@ class Shader(nn.Module):
             reach = max(reach, pixel - first, last - pixel)
         return reach
 
+    @abstractmethod
     def shade(self, gbuffer: Tensor, covered: Tensor) -> Tensor:
         """The network itself: (N, C, H, W) and coverage (N, 1, H, W) to (N, outputs, H, W)."""
-        raise NotImplementedError
 
     def forward(self, gbuffer: Tensor) -> Tensor:
         """Shade (N, C, H, W); unbounded while training, [0, 1] in evaluation mode."""
@@ -108,17 +109,7 @@ class PaperUNet(Shader):
 
     def needs(self, pixel: int) -> Span:
         """See `Shader.needs`."""
-        reach, last = self.config.kernel // 2, len(self.config.widths) - 1
-        skips, span = [], (pixel, pixel)
-        for _ in range(last):
-            span = _grown(span, reach)
-            skips.append(span)
-            span = _doubled(span)
-        for n in reversed(range(last + 1)):
-            span = _joined(span, skips[n]) if n < last else span
-            span = _grown(span, reach)
-            span = _folded(span, 2) if n else span
-        return span
+        return _through_u((pixel, pixel), len(self.config.widths), self.config.kernel // 2)
 
     def shade(self, gbuffer: Tensor, covered: Tensor) -> Tensor:
         """See `Shader.shade`."""
@@ -173,18 +164,10 @@ class FoldUNet(Shader):
 
     def needs(self, pixel: int) -> Span:
         """See `Shader.needs`."""
-        fold, blocks = self.config.fold, 2 * self.config.depth
-        last = len(self.config.widths) - 1
-        skips, span = [], _grown((pixel // fold, pixel // fold), 1)
-        for _ in range(last):
-            span = _grown(span, blocks)
-            skips.append(span)
-            span = _doubled(span)
-        for n in reversed(range(last + 1)):
-            span = _joined(span, skips[n]) if n < last else span
-            span = _grown(span, blocks)
-            span = _folded(span, 2) if n else span
-        first, final = _folded(_grown(span, 1), fold)
+        fold = self.config.fold
+        head = _grown((pixel // fold, pixel // fold), 1)
+        door = _through_u(head, len(self.config.widths), 2 * self.config.depth)
+        first, final = _folded(_grown(door, 1), fold)
         span = first, final
         for window in self.config.windows:  # the two nearest blocks of each pixel
             low = (first - window // 2) // window * window
@@ -265,6 +248,19 @@ def _folded(span: Span, factor: int) -> Span:
 
 def _joined(a: Span, b: Span) -> Span:
     return min(a[0], b[0]), max(a[1], b[1])
+
+
+def _through_u(span: Span, levels: int, reach: int) -> Span:
+    """What a U of `levels` needs, whose convolutions reach `reach` pixels a level and side."""
+    skips = []
+    for _ in range(levels - 1):
+        span = _grown(span, reach)
+        skips.append(span)
+        span = _doubled(span)
+    span = _grown(span, reach)
+    for skip in reversed(skips):
+        span = _grown(_joined(_folded(span, 2), skip), reach)
+    return span
 
 
 def _blocks(width: int, depth: int) -> nn.Sequential:

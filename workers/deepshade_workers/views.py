@@ -93,7 +93,7 @@ def _random_camera(
 
 def _shrunk(camera: Camera, size: int) -> Camera:
     """The same window seen with `PROBE`² pixels: the window's own narrower, shifted camera."""
-    plane = 2 / (2 * camera.pixels_per_unit)  # one pixel's width at distance 1
+    plane = 1 / camera.pixels_per_unit  # one pixel's width at distance 1
     cx = (camera.x0 + size / 2 - camera.width / 2) * plane
     cy = (camera.height / 2 - camera.y0 - size / 2) * plane
     fov = float(np.degrees(2 * np.arctan(size * plane / 2)))
