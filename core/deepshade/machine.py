@@ -1,12 +1,15 @@
-"""What this process may use of the machine: CPUs (also inside a container's quota) and memory."""
+"""What this process may use of the machine, and does: CPUs (also by a quota), and memory."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
+import sys
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -51,6 +54,33 @@ def memory_bytes(root: Path = _CGROUP) -> int:
             continue
         return min(total, limit) if total else limit
     return total
+
+
+def resident() -> int:
+    """Bytes of this process in physical memory; 0 where the system doesn't say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:  # not Linux
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def trim() -> None:
+    """Return freed memory to the system. glibc otherwise keeps what lies below its heap's top."""
+    give_back = _malloc_trim()
+    if give_back is not None:
+        give_back(0)
+
+
+@cache
+def _malloc_trim() -> Any:
+    """None where there is none."""
+    if not sys.platform.startswith("linux"):
+        return None
+    try:
+        return ctypes.CDLL(None).malloc_trim
+    except (OSError, AttributeError):  # musl has no malloc_trim
+        return None
 
 
 def describe() -> str:

@@ -3,15 +3,17 @@
 import io
 import os
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 
-from deepshade import exr, exrheader
+from deepshade import exr, exrchunks, exrdecode
 from deepshade.errors import DamagedImageError, ImageError, LimitError
 from deepshade.exr import Limits
+from deepshade.threads import thread_count
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "exr"
 LOSSLESS = ("none", "rle", "zips", "zip", "piz")
@@ -326,7 +328,7 @@ def test_a_bomb_is_refused_by_its_decoded_size():
 
 
 def test_long_chunk_tables_are_checked_in_blocks(monkeypatch):
-    monkeypatch.setattr(exrheader, "_TABLE_BLOCK", 7)
+    monkeypatch.setattr(exrchunks, "_TABLE_BLOCK", 7)
     body = encode({"Y": plane(40, 3)}, compression="none")
     np.testing.assert_array_equal(exr.read(body).pixels["Y"], plane(40, 3))
     for end in range(len(body) - 40, len(body)):
@@ -338,6 +340,125 @@ def test_damaged_pixels():
     body = bytearray(encode({"Y": plane(64, 64).round()}))
     body[-400:-200] = os.urandom(200)
     with pytest.raises(DamagedImageError):
+        exr.read(bytes(body))
+
+
+@pytest.fixture
+def small_strips(monkeypatch):
+    """As if images were too large to be decoded at once."""
+    monkeypatch.setattr(exrdecode, "_LEAST", 500)
+    monkeypatch.setattr(exrdecode, "_MOST", 1000)
+
+
+def by_library(body):
+    """Every part's channels as the library decodes them, converted by numpy."""
+    with OpenEXR.File(io.BytesIO(body), separate_channels=True) as file:
+        return [
+            {name: channel.pixels.astype(np.float32) for name, channel in part.channels.items()}
+            for part in file.parts
+        ]
+
+
+@pytest.mark.parametrize("compression", exr.COMPRESSIONS)
+def test_strips_give_what_the_whole_gives(compression, small_strips):
+    planes = {"a": plane(300, 9), "layer.b": plane(300, 9, 1), "c": plane(300, 9, 2)}
+    body = encode(planes, compression=compression, half=["a", "c"], origin=(-4, -7))
+    assert len(exrdecode._strips(exr.read_header(body).parts[0], 9)) > 1
+    image, (expected,) = exr.read(body), by_library(body)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(image.pixels[name], values)
+
+
+@pytest.mark.parametrize("compression", ["NO", "ZIP", "PIZ"])
+def test_parts_of_all_kinds_are_read_alone(compression, small_strips):
+    header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "owner": "x" * 5000}
+    header["displayWindow"] = window(0, 0, 99, 99)
+    tiled = {"type": OpenEXR.tiledimage, "tiles": tiles(16, 16)}
+    lines = {"type": OpenEXR.scanlineimage}
+    halves = {name: plane(77, 40, seed).astype(np.float16) for seed, name in enumerate("XYZ")}
+    made = [
+        OpenEXR.Part({**lines, **header}, {"Q": plane(50, 41)}, "q"),
+        OpenEXR.Part({**lines, **header}, halves, "n"),
+        OpenEXR.Part(
+            {**lines, **header, "lineOrder": OpenEXR.DECREASING_Y},
+            {"id": np.arange(77 * 40, dtype=np.uint32).reshape(77, 40), "Z": plane(77, 40, 9)},
+            "d",
+        ),
+        OpenEXR.Part({**tiled, **header}, {"T": plane(33, 50)}, "t"),
+    ]
+    body = by_openexr(made)
+    expected = by_library(body)
+    places = exr.read_header(body).channels()
+    for name, (part, channel) in places.items():
+        image = exr.read(body, [name])
+        assert list(image.pixels) == [name]
+        np.testing.assert_array_equal(image.pixels[name], expected[part][channel])
+    everything = exr.read(body)
+    for name, (part, channel) in places.items():
+        np.testing.assert_array_equal(everything.pixels[name], expected[part][channel])
+
+
+def test_parts_without_wanted_channels_are_not_decoded():
+    body = bytearray(multipart())
+    start = exr.read_header(bytes(body)).parts[1].chunks.table(memoryview(body)).min()
+    body[int(start) + 12 :] = bytes(len(body) - int(start) - 12)  # the pixels of "p", the last
+    exr.read(bytes(body), ["n:X"])
+    with pytest.raises(DamagedImageError):
+        exr.read(bytes(body), ["p:X"])
+
+
+def test_unwanted_channels_are_there_only_strip_by_strip(monkeypatch):
+    monkeypatch.setattr(exrdecode, "_MOST", 2**20)
+    size = 512 * 512 * 4
+    body = encode({f"c{n:02}": plane(512, 512) for n in range(24)}, compression="none", half=True)
+    for compressed in (body, encode(exr.read(body).pixels, compression="zip", half=True)):
+        header = exr.read_header(compressed)
+        tracemalloc.start()
+        exr.read(compressed, ["c07"], header=header)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        # the plane itself, and for each thread a strip: cut out, and decoded
+        assert peak < size + thread_count() * 4 * 2**20 < 12 * size
+
+
+def test_what_is_not_finite_is_named():
+    planes = {name: plane() for name in "abcd"}
+    planes["b"][3, 4], planes["d"][0, 0], planes["a"][1, 1] = np.nan, -np.inf, 1e30
+    for settings in ({}, {"half": True}, {"compression": "none"}):
+        assert exr.read(encode(planes, **settings)).nonfinite == {"b", "d"}
+    assert exr.read(encode(planes), ["a", "c"]).nonfinite == frozenset()
+
+
+def test_tiles_in_the_wrong_place_are_refused():
+    header = {"type": OpenEXR.tiledimage, "tiles": tiles(16, 16)}
+    body = bytearray(by_openexr([OpenEXR.Part(header, {"Y": plane(40, 40)}, "")]))
+    first = int(exr.read_header(bytes(body)).parts[0].chunks.table(memoryview(bytes(body)))[0])
+    struct.pack_into("<2i", body, first, 1, 1)
+    with pytest.raises(DamagedImageError, match="another tile"):
+        exr.read(bytes(body))
+
+
+@pytest.mark.parametrize("level", [1, 9])
+def test_the_zip_level_changes_the_size_alone(level):
+    smooth = np.add.outer(np.sin(np.arange(99) / 9), np.arange(80) / 70).astype(np.float32)
+    try:
+        exr.set_zip_level(level)
+        body = encode({"Y": smooth}, half=True)
+        exr.set_zip_level(4)
+        usual = encode({"Y": smooth}, half=True)
+    finally:
+        exr.set_zip_level(1)
+    assert (len(body) > len(usual)) == (level == 1)
+    np.testing.assert_array_equal(exr.read(body).pixels["Y"], exr.read(usual).pixels["Y"])
+
+
+def test_overlapping_chunks_are_refused():
+    """Cut apart, they would be larger than the file they came in."""
+    body = bytearray(encode({"Y": plane(200, 40)}, compression="zips"))
+    chunks = exr.read_header(bytes(body)).parts[0].chunks
+    for offset in chunks.table(memoryview(bytes(body))).tolist():
+        struct.pack_into("<i", body, offset + 4, len(body) - offset - 8)
+    with pytest.raises(DamagedImageError, match="overlap"):
         exr.read(bytes(body))
 
 
