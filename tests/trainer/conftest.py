@@ -70,5 +70,5 @@ def data(tmp_path_factory: Any) -> Path:
 
 @pytest.fixture
 def recipe() -> Recipe:
-    network = NetworkConfig(widths=(8, 12), windows=(4, 16))
+    network = NetworkConfig(widths=(8, 12), steps=(2,), down=(1, 1), up=(1,))
     return Recipe(network=network, batch=4, steps=6, warmup=2, held_out=0.2, precision="fp32")

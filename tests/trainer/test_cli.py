@@ -12,7 +12,14 @@ from PIL import Image
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.cli import main
 
-SETTINGS = ["steps=4", "batch=4", "network.widths=[8,12]", "network.windows=[4,16]"]
+SETTINGS = [
+    "steps=4",
+    "batch=4",
+    "network.widths=[8,12]",
+    "network.steps=[2]",
+    "network.down=[1,1]",
+    "network.up=[1]",
+]
 
 
 @pytest.mark.slow
@@ -42,6 +49,14 @@ def test_train_export_evaluate(
     assert set(document["views"][0]) >= {"scene", "ssim", "psnr", "mae", "flip", "trivial_ssim"}
     assert np.asarray(Image.open(sheet)).shape[2] == 3
     assert errors["exact"]["views"] >= 3
+    assert "## Engines and precision" in card
+    assert (document["engine"], document["precision"]) == ("onnxruntime", "fp32")
+    assert main([*evaluate, "--engine", "openvino", "--json"]) == 0
+    other_engine = json.loads(capsys.readouterr().out)
+    assert other_engine["engine"] == "openvino"
+    assert other_engine["mean"]["ssim"] == pytest.approx(document["mean"]["ssim"], abs=1e-3)
+    assert main([*evaluate, "--precision", "fp64"]) == 2
+    assert "no precision 'fp64'" in capsys.readouterr().err
     assert main(evaluate) == 0
     assert "x the trivial answer's" in capsys.readouterr().out
 

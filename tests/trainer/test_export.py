@@ -7,16 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime as ort
 import pytest
 import torch
 
 from deepshade import metrics
 from deepshade.bundles import Bundle
-from deepshade.errors import DataError
+from deepshade.engines import REFERENCE, Backend, load_engine, usable
+from deepshade.errors import DataError, EngineError
+from deepshade.probe import dssim, read_probe
 from deepshade_trainer.card import write_card
+from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.evaluation import Variant, contact_sheet, document, evaluate, summary
-from deepshade_trainer.export import TOLERANCE, export, load_shader, parity
+from deepshade_trainer.export import TOLERANCE, choose_probe, export, load_shader, parity
 from deepshade_trainer.recipe import preset
 from deepshade_trainer.run import Run
 from deepshade_trainer.training import train
@@ -27,7 +31,10 @@ def trained(data: Path, tmp_path_factory: Any) -> Run:
     """A few steps of a small network."""
     run = Run(tmp_path_factory.mktemp("run"))
     recipe = preset("default", "ao").changed(
-        network={"widths": (8, 12), "windows": (4, 16)}, batch=4, steps=8, precision="fp32"
+        network={"widths": (8, 12), "steps": (2,), "down": (1, 1), "up": (1,)},
+        batch=4,
+        steps=8,
+        precision="fp32",
     )
     list(train(recipe, [data], run))
     return run
@@ -92,6 +99,51 @@ def test_evaluation_equals_the_metrics_by_hand(bundle: Bundle, data: Path) -> No
     assert mean["ratio"] == pytest.approx(mean["dssim"] / mean["trivial_dssim"])
     assert contact_sheet(rows, columns=1).shape == (3 * 64 + 2 * 4, 4 * 64 + 3 * 4, 3)
     assert json.loads(json.dumps(document(bundle, rows, Variant())))["mean"]["views"] == 3
+
+
+def test_an_export_brings_an_int8_graph_and_a_probe(bundle: Bundle, data: Path) -> None:
+    """Eight bits stay near 32, and the probe's error equals the evaluation's by hand."""
+    assert bundle.int8 is not None
+    int8 = onnx.load(str(bundle.int8))
+    quantised = {node.input[0] for node in int8.graph.node if node.op_type == "Conv"}
+    exact = [name for name in quantised if "DequantizeLinear" not in name]
+    assert "gbuffer" in exact  # the first convolutions and the last stay in float
+    assert 2 <= len(exact) < len(quantised)
+    windows = read_probe(bundle)
+    assert 1 <= len(windows) <= 4
+    errors = {}
+    for backend in usable(bundle):
+        engine = load_engine(bundle, backend, threads=1)
+        errors[backend] = dssim(engine, windows)
+        gbuffer = windows[0][0][None]
+        difference = engine.predict(gbuffer) - load_engine(bundle, REFERENCE, threads=1).predict(
+            gbuffer
+        )
+        assert np.abs(difference).max() < 0.1, backend
+    assert {backend.precision for backend in errors} >= {"fp32", "int8"}
+    for error in errors.values():
+        assert error == pytest.approx(errors[REFERENCE], rel=0.2)
+
+
+def test_the_probe_holds_scenes_that_training_did_not_see(data: Path) -> None:
+    samples = Dataset([data], "ao")
+    training, held = samples.split(0.3)
+    seen = [samples.gbuffer(samples.load(k), 0.5) for k in training]
+    windows = choose_probe(samples, held, 16)
+    assert 0 < len(windows) <= 4
+    largest = [np.abs(gbuffer).max() for gbuffer, _ in windows]
+    assert largest == sorted(largest)
+    assert not any(np.array_equal(window[0], one) for window in windows for one in seen)
+    assert choose_probe(samples, held, 128) == []
+
+
+def test_evaluation_on_every_backend(bundle: Bundle, data: Path) -> None:
+    exact = summary(list(evaluate(bundle, [data], limit=3)))
+    for backend in usable(bundle):
+        mean = summary(list(evaluate(bundle, [data], limit=3, backend=backend)))
+        assert mean["ssim"] == pytest.approx(exact["ssim"], abs=0.05)
+    with pytest.raises(EngineError):
+        list(evaluate(bundle, [data], backend=Backend("openvino", "fp64")))
 
 
 def test_variants_change_inputs_and_little_else(bundle: Bundle, data: Path) -> None:

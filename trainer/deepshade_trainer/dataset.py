@@ -26,6 +26,9 @@ Sample = dict[str, NDArray[np.float32]]
 
 # Shares of batches that see 16-bit positions, as renderers store them.
 HALF_POSITIONS = 0.3
+# Shares of batches whose normals are too short, as interpolation and filtering leave them.
+SHORT_NORMALS = 0.3
+SHORTEST = 0.8
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,8 @@ class Dataset:
     ) -> tuple[Tensor, Tensor]:
         """G-buffers (N, C, H, W) and references (N, outputs, H, W).
 
-        With `rng`, each sample is turned by a random symmetry and some have 16-bit positions.
+        With `rng`, each sample is turned by a random symmetry; some have 16-bit positions, some
+        normals that are too short.
         """
         inputs, references = [], []
         for number in numbers:
@@ -129,6 +133,9 @@ class Dataset:
             }
             if half and "position" in turned:
                 turned["position"] = rounded(turned["position"])
+            if rng is not None and "normal" in turned and rng.random() < SHORT_NORMALS:
+                lengths = rng.uniform(SHORTEST, 1, (1, *turned["normal"].shape[1:]))
+                turned["normal"] = turned["normal"] * lengths.astype(np.float32)
             inputs.append(self.gbuffer(turned, float(self.entries[number].record["radius"])))
             references.append(turned[self.reference])
         return torch.from_numpy(np.stack(inputs)), torch.from_numpy(np.stack(references))

@@ -1,0 +1,39 @@
+"""Runs of pixels along one axis, and what each kind of layer needs of the one before it."""
+
+from __future__ import annotations
+
+# First and last.
+Span = tuple[int, int]
+
+
+def grown(span: Span, reach: int) -> Span:
+    """What a convolution that reaches `reach` pixels needs."""
+    return span[0] - reach, span[1] + reach
+
+
+def doubled(span: Span) -> Span:
+    """What bilinear x 2 needs of the coarser level: the two nearest of each pixel."""
+    return (span[0] - 1) // 2, (span[1] - 1) // 2 + 1
+
+
+def folded(span: Span, factor: int) -> Span:
+    """What pooling or folding by `factor` needs of the finer level."""
+    return span[0] * factor, span[1] * factor + factor - 1
+
+
+def joined(a: Span, b: Span) -> Span:
+    """The run that holds both."""
+    return min(a[0], b[0]), max(a[1], b[1])
+
+
+def through_u(span: Span, levels: int, reach: int) -> Span:
+    """What a U of `levels` needs, whose convolutions reach `reach` pixels a level and side."""
+    skips = []
+    for _ in range(levels - 1):
+        span = grown(span, reach)
+        skips.append(span)
+        span = doubled(span)
+    span = grown(span, reach)
+    for skip in reversed(skips):
+        span = grown(joined(folded(span, 2), skip), reach)
+    return span
