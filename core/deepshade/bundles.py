@@ -18,10 +18,13 @@ from deepshade.files import replacing, sha256
 
 MODEL = "model.onnx"
 WEIGHTS = "model.safetensors"
+INT8 = "model.int8.onnx"
+PROBE = "probe.exr"
 CONFIG = "config.json"
 METRICS = "metrics.json"
 
 _MAX_BYTES = {CONFIG: 1 << 20, METRICS: 16 << 20, MODEL: 1 << 30, WEIGHTS: 1 << 30}
+_MAX_BYTES |= {INT8: 1 << 30, PROBE: 64 << 20}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _SCALES = ("1/radius", "none")
 
@@ -34,8 +37,13 @@ class Bundle:
     `position_scale` ("1/radius", or "none"). `radius` is the default effect radius in scene
     units and `fov` the horizontal angle in degrees that it was trained at. Image sides must be
     multiples of `size_multiple`; pixels within `halo` of a tile's inner side depend on its
-    neighbour. `ranges` are the (lowest, highest) values seen in training; `hashes` maps file
-    names to sha256.
+    neighbour. Background farther than `background_halo` from all geometry changes no pixel of
+    it, so it need not be computed (as far as `halo`, unless the configuration says less). `ranges`
+    are the (lowest, highest) values seen in training; `hashes` maps file names to sha256.
+
+    Two files may be absent: the graph in 8 bits (`INT8`), quantised on real G-buffers, and
+    `PROBE`, a few held-out G-buffers with their reference, on which a machine measures what a
+    precision costs it (see `deepshade.probe`).
     """
 
     path: Path
@@ -54,6 +62,11 @@ class Bundle:
     position_scale: str = "1/radius"
     input_name: str = "gbuffer"
     output_name: str = "shade"
+    background_halo: int = -1
+
+    def __post_init__(self) -> None:
+        if self.background_halo < 0:
+            object.__setattr__(self, "background_halo", self.halo)
 
     @property
     def model(self) -> Path:
@@ -64,6 +77,16 @@ class Bundle:
     def weights(self) -> Path:
         """The same weights for further training."""
         return self.path / WEIGHTS
+
+    @property
+    def int8(self) -> Path | None:
+        """The ONNX graph in 8 bits, None without one."""
+        return self.path / INT8 if INT8 in self.hashes else None
+
+    @property
+    def probe(self) -> Path | None:
+        """Held-out G-buffers with their reference, None without them."""
+        return self.path / PROBE if PROBE in self.hashes else None
 
     @property
     def sha256(self) -> str:
@@ -128,9 +151,11 @@ def write_config(
     position_scale: str = "1/radius",
     input_name: str = "gbuffer",
     output_name: str = "shade",
+    background_halo: int | None = None,
 ) -> Bundle:
     """Completes a bundle's folder that already holds its model files: hashes and configuration.
 
+    The optional files count if they are there: remove what belongs to an older model before.
     Written atomically, `config.json` last: a folder without it is no bundle yet. Raises
     BundleError for missing files or impossible values.
     """
@@ -149,13 +174,20 @@ def write_config(
         "size_multiple": size_multiple,
         "halo": halo,
         "ranges": {key: list(value) for key, value in (ranges or {}).items()},
-        "hashes": {file: _hash(path / file) for file in (MODEL, WEIGHTS)},
+        "hashes": {file: _hash(path / file) for file in _files(path)},
     }
+    if background_halo is not None:
+        config["background_halo"] = background_halo
     bundle = _from_config(path, config, dict(metrics or {}))
     if metrics is not None:
         _write_json(path / METRICS, metrics)
     _write_json(path / CONFIG, config)
     return bundle
+
+
+def _files(path: Path) -> list[str]:
+    """What a bundle's folder holds of the files that its configuration vouches for."""
+    return [MODEL, WEIGHTS, *(name for name in (INT8, PROBE) if (path / name).exists())]
 
 
 def _hash(path: Path) -> str:
@@ -252,6 +284,7 @@ _CHECKS: dict[str, tuple[Any, str]] = {
     "fov": (lambda v: _number(v) and 0 < v < 180, "degrees between 0 and 180"),
     "size_multiple": (lambda v: _whole(v, 1, 4096), "a whole number from 1 to 4096"),
     "halo": (lambda v: _whole(v, 0, 8192), "a whole number from 0 to 8192"),
+    "background_halo": (lambda v: _whole(v, 0, 8192), "a whole number from 0 to 8192"),
     "ranges": (_ranges, "pairs of numbers, lowest first"),
     "hashes": (_hashes, "file names with sha256 digests"),
 }

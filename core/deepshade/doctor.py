@@ -50,7 +50,7 @@ def doctor(
 
 
 def run_checks(checks: Sequence[Callable[[], list[Check]]] | None = None) -> list[Check]:
-    """Every check's findings; none of them imports a heavy package."""
+    """Every check's findings."""
     return [check for function in (checks or _CHECKS) for check in function()]
 
 
@@ -129,6 +129,22 @@ def check_machine() -> list[Check]:
     ]
 
 
+def check_engines() -> list[Check]:
+    """What networks can run on here; at least one engine is needed once the service is installed.
+
+    Loads the engines' libraries, which takes a moment.
+    """
+    from deepshade.engines import available
+
+    found = available()
+    listed: dict[str, list[str]] = {}
+    for backend in found:
+        listed.setdefault(backend.engine, []).append(backend.precision)
+    detail = "; ".join(f"{engine} ({', '.join(kinds)})" for engine, kinds in listed.items())
+    fix = "" if found else "pip install 'deepshade[service]'"
+    return [Check("engines", bool(found), installed("fastapi"), detail or "none", fix)]
+
+
 def check_bundles(root: Path | None = None) -> list[Check]:
     """The shipped models: each must match its hashes."""
     from deepshade.bundles import Bundle, bundle_folders, bundle_root
@@ -170,6 +186,7 @@ _CHECKS: tuple[Callable[[], list[Check]], ...] = (
     check_llvm,
     check_shared_memory,
     check_machine,
+    check_engines,
     check_bundles,
     check_port,
 )

@@ -86,6 +86,10 @@ class BundleError(DeepshadeError):
     """A model bundle is incomplete, malformed, or its files don't match their hashes."""
 
 
+class EngineError(DeepshadeError):
+    """A network can't run on the engine or in the precision that was asked for."""
+
+
 class DataError(DeepshadeError):
     """A data set (shards, manifest) is incomplete, damaged or of another schema."""
 

@@ -73,6 +73,28 @@ def test_where_models_are(tmp_path, monkeypatch):
     assert str(bundle_root()) == "/elsewhere"
 
 
+def test_optional_files_are_verified_too(folder):
+    plain = make(folder)
+    assert plain.int8 is None
+    assert plain.probe is None
+    for name in ("model.int8.onnx", "probe.exr"):
+        (folder / name).write_bytes(name.encode())
+    make(folder)
+    loaded = Bundle.load(folder)
+    assert loaded.int8 == folder / "model.int8.onnx"
+    assert loaded.probe == folder / "probe.exr"
+    (folder / "probe.exr").write_bytes(b"other")
+    with pytest.raises(BundleError, match="is not the file"):
+        Bundle.load(folder)
+
+
+def test_background_reaches_as_far_as_the_halo_or_less(folder):
+    assert make(folder).background_halo == 96
+    assert "background_halo" not in json.loads((folder / "config.json").read_text())
+    assert make(folder, background_halo=8).background_halo == 8
+    assert Bundle.load(folder).background_halo == 8
+
+
 @pytest.mark.parametrize("name", ["model.onnx", "model.safetensors"])
 def test_refuses_changed_and_missing_files(folder, name):
     make(folder)
@@ -107,6 +129,7 @@ def test_unknown_entries_name_the_nearest(folder):
         {"outputs": ["Y", "Y"]},
         {"halo": -1},
         {"halo": 1.5},
+        {"background_halo": -1},
         {"size_multiple": 0},
         {"name": "../../etc"},
         {"position_scale": "radius"},

@@ -62,6 +62,18 @@ def test_cgroup_quota(tmp_path):
     assert machine.cpu_count() >= 1
 
 
+def test_engines_are_listed(monkeypatch):
+    from deepshade import engines
+
+    (check,) = doctor.check_engines()
+    assert check.ok
+    assert "onnxruntime (fp32" in check.detail
+    monkeypatch.setattr(engines, "available", lambda: ())
+    (check,) = doctor.check_engines()
+    assert not check.ok
+    assert "deepshade[service]" in check.fix
+
+
 def test_a_taken_port_is_a_warning():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from deepshade.bundles import METRICS, Bundle
+from deepshade.engines import REFERENCE, load_engine, usable
 from deepshade.files import replacing
-from deepshade.machine import describe
+from deepshade.machine import cpu_count, describe
 
-from .evaluation import Shaded, Variant, evaluate, summary
+from .evaluation import Variant, evaluate, summary
 from .recipe import Recipe
 from .run import Run
 
@@ -32,7 +33,11 @@ VARIANTS = {
 
 
 def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
-    """Add error over each test folder, under every variant of the inputs, and speed."""
+    """Add to its metrics: errors over each test folder, and the speed, of every backend here.
+
+    `error` holds, for each folder, the summary under every variant of the inputs in fp32, and
+    `backends` each other backend's on the exact inputs, with `added`, its DSSIM over fp32's - 1.
+    """
     errors = {
         folder.name: {
             name: summary(list(evaluate(bundle, [folder], variant=variant)))
@@ -40,27 +45,46 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
         }
         for folder in folders
     }
-    found = {**bundle.metrics, "error": errors, "speed": speed(bundle)}
+    others = [backend for backend in usable(bundle) if backend != REFERENCE]
+    backends: dict[str, Any] = {}
+    for folder in folders:
+        exact = errors[folder.name]["exact"]["dssim"]
+        backends[folder.name] = {}
+        for backend in others:
+            mean = summary(list(evaluate(bundle, [folder], backend=backend)))
+            backends[folder.name][str(backend)] = {**mean, "added": mean["dssim"] / exact - 1}
+    found = {**bundle.metrics, "error": errors, "backends": backends, "speed": speed(bundle)}
     with replacing(bundle.path / METRICS) as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
     return dataclasses.replace(bundle, metrics=found)
 
 
 def speed(bundle: Bundle, repeats: int = 9) -> dict[str, Any]:
-    """Median milliseconds of ONNX Runtime fp32 at `SPEED_SIZE`, and the machine."""
+    """Median milliseconds at `SPEED_SIZE` of each backend, in turns, and the machine."""
     width, height = SPEED_SIZE
+    step = bundle.size_multiple
+    rows, columns = -(-height // step) * step, -(-width // step) * step
     rng = np.random.default_rng(0)
-    gbuffer = rng.normal(size=(6, height, width)).astype(np.float32)
-    gbuffer[5] = -np.abs(gbuffer[5]) - 4
-    shader, times = Shaded(bundle), []
-    for _ in range(repeats + 2):
-        start = time.perf_counter()
-        shader(gbuffer)
-        times.append(1e3 * (time.perf_counter() - start))
+    backends = usable(bundle)
+    engines = [load_engine(bundle, backend, threads=cpu_count()) for backend in backends]
+    gbuffer = rng.normal(size=(1, engines[0].channels, rows, columns)).astype(np.float32)
+    gbuffer[:, 5:6] = -np.abs(gbuffer[:, 5:6]) - 4
+    for engine in engines:
+        engine.warm()
+        engine.prepare(rows, columns)
+    times: dict[str, list[float]] = {str(backend): [] for backend in backends}
+    for turn in range(repeats + 2):
+        for engine in engines:
+            start = time.perf_counter()
+            engine.predict(gbuffer)
+            if turn > 1:
+                times[str(engine.backend)].append(1e3 * (time.perf_counter() - start))
+    medians = {name: round(float(np.median(taken)), 2) for name, taken in times.items()}
     return {
         "size": [width, height],
-        "engine": "ONNX Runtime fp32",
-        "median_ms": round(float(np.median(times[2:])), 1),
+        "engine": str(backends[0]),
+        "median_ms": medians[str(backends[0])],
+        "backends": medians,
         "machine": describe(),
     }
 
@@ -99,16 +123,34 @@ def write_card(bundle: Bundle, run: Run, note: str) -> None:
                     f"| {mean['dssim']:.4f} | {mean['trivial_dssim']:.4f} "
                     f"| {mean['ratio']:.3f} |"
                 )
-        speed_ = bundle.metrics["speed"]
-        lines += [
-            "",
-            "## Speed",
-            "",
-            f"{speed_['median_ms']} ms at {speed_['size'][0]} x {speed_['size'][1]}, "
-            f"{speed_['engine']}, {speed_['machine']}.",
-            "",
-        ]
+        lines += ["", *_backends(bundle)]
     lines += ["## Recipe", "", "```json", json.dumps(asdict(recipe), indent=1), "```", ""]
     text = "\n".join(lines) + ("\n" + note.strip() + "\n" if note else "")
     with replacing(bundle.path / "README.md") as temporary:
         temporary.write_text(text)
+
+
+def _backends(bundle: Bundle) -> list[str]:
+    """Speed and error of every engine and precision, as a table."""
+    taken = bundle.metrics["speed"]
+    by_folder: dict[str, Any] = bundle.metrics.get("backends", {})
+    lines = [
+        "## Engines and precision",
+        "",
+        f"Milliseconds of the network at {taken['size'][0]} x {taken['size'][1]} on "
+        f"{taken['machine']}, and what each precision adds to the DSSIM of fp32.",
+        "",
+        "| engine | precision | ms | "
+        + " | ".join(f"added on {name}" for name in by_folder)
+        + " |",
+        "|---|---|---|" + "---|" * len(by_folder),
+    ]
+    for name, milliseconds in sorted(taken["backends"].items(), key=lambda item: item[1]):
+        engine, _, precision = name.partition("/")
+        added = [
+            f"{100 * errors[name]['added']:+.2f} %" if name in errors else "0"
+            for errors in by_folder.values()
+        ]
+        cells = [engine, precision, f"{milliseconds:.1f}", *added]
+        lines.append(f"| {' | '.join(cells)} |")
+    return [*lines, ""]

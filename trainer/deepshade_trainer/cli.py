@@ -1,8 +1,9 @@
-"""`deepshade train`, `deepshade evaluate` and `deepshade export`."""
+"""`deepshade train`, `search`, `evaluate` and `export`."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +17,9 @@ def train(
     effect: Effect,
     data: Data,
     out: Annotated[Path, typer.Option(help="Run folder; an existing run goes on.")],
-    preset: Annotated[str, typer.Option(help="default, paper or paper-network.")] = "default",
+    preset: Annotated[
+        str, typer.Option(help="fast, balanced, best, paper or paper-network.")
+    ] = "balanced",
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="Change one setting: --set steps=4000; repeatable."),
@@ -74,6 +77,82 @@ def train(
     typer.echo(f"the run is in {out}")
 
 
+def search(
+    effect: Effect,
+    data: Data,
+    out: Annotated[Path, typer.Option(help="Search folder; an existing search goes on.")],
+    minutes: Annotated[float, typer.Option(help="Begin no trial after so long.", min=0)] = 60.0,
+    steps: Annotated[int, typer.Option(help="Training steps of a first trial.", min=1)] = 400,
+    most_ms: Annotated[
+        float, typer.Option(help="Leave out networks slower than this at 768 x 512.", min=0)
+    ] = 25.0,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Change one setting of the recipe: --set batch=4; repeatable."),
+    ] = None,
+    device: Annotated[str, typer.Option(help="'cpu' or 'cuda', for training.")] = "cpu",
+    threads: Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the frontier as JSON.")] = False,
+) -> None:
+    """Search for networks that are faster or more accurate. Ctrl-C stops; the same command goes on.
+
+    Each trial is trained a little and timed on this machine's fastest engine; those that no other
+    one beats at their speed are trained three times longer, up to three times over.
+
+    Examples:
+
+    deepshade search ao --data data/ao --out runs/search --minutes 600
+    """
+    import torch
+    from rich.console import Console
+    from rich.table import Table
+
+    from deepshade.machine import cpu_count
+
+    from .recipe import preset as load_preset
+    from .search import frontier, label, read_trials
+    from .search import search as trials
+
+    if threads:
+        torch.set_num_threads(threads)
+    recipe = load_preset("balanced", effect).changed(**_parse(settings or []))
+    console = Console(stderr=True)
+    with console.status("searching") as status:
+        found = trials(
+            recipe,
+            data,
+            out,
+            minutes=minutes,
+            steps=steps,
+            most_ms=most_ms,
+            threads=threads or cpu_count(),
+            device=device,
+            report=lambda network, rung, progress: status.update(
+                f"rung {rung}, {label(network)}: step {progress.step} of {progress.steps}"
+            ),
+        )
+        for trial in found:
+            console.print(
+                f"rung {trial.rung}: {trial.ms:6.2f} ms  DSSIM {trial.dssim:.4f} "
+                f"({trial.ratio:.3f} x all white)  {trial.label}"
+            )
+    best = frontier(read_trials(out / "trials.jsonl"))
+    if as_json:
+        typer.echo(json.dumps([asdict(trial) for trial in best], indent=2))
+        return
+    table = Table("ms at 768 x 512", "DSSIM", "x all white", "rung", "parameters", "network")
+    for trial in best:
+        table.add_row(
+            f"{trial.ms:.2f}",
+            f"{trial.dssim:.4f}",
+            f"{trial.ratio:.3f}",
+            str(trial.rung),
+            f"{trial.parameters:,}",
+            trial.label,
+        )
+    Console().print(table)
+
+
 def evaluate(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder, such as models/ao/balanced.")],
     data: Data,
@@ -87,6 +166,8 @@ def evaluate(
     stretch: Annotated[
         float, typer.Option(help="Shorten normals at random by up to this share.", min=0, max=0.99)
     ] = 0.0,
+    engine: Annotated[str, typer.Option(help="onnxruntime, openvino, …")] = "onnxruntime",
+    precision: Annotated[str, typer.Option(help="fp32, bf16, fp16 or int8.")] = "fp32",
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Measure a bundle against references: SSIM, PSNR, MAE, FLIP of each view and the mean.
@@ -94,6 +175,8 @@ def evaluate(
     Every figure stands beside that of the trivial answer (all white for ao) on the same views.
 
       deepshade evaluate models/ao/balanced --data data/test --sheet out/sheet.png
+
+      deepshade evaluate models/ao/fast --data data/test --engine openvino --precision bf16
     """
     from rich.console import Console
     from rich.progress import track
@@ -101,25 +184,23 @@ def evaluate(
 
     from deepshade import pictures
     from deepshade.bundles import Bundle
+    from deepshade.engines import Backend
 
     from .evaluation import Variant, contact_sheet, document, summary
     from .evaluation import evaluate as measure
 
     found = Bundle.load(bundle)
     variant = Variant(tuple(name for name in half.split(",") if name), scale, stretch)
+    backend = Backend(engine, precision)
     noise = Console(stderr=True)
-    rows = list(
-        track(
-            measure(found, data, min_contrast=min_contrast, limit=limit, variant=variant),
-            "shading",
-            console=noise,
-            disable=not noise.is_terminal,
-        )
+    shaded = measure(
+        found, data, min_contrast=min_contrast, limit=limit, variant=variant, backend=backend
     )
+    rows = list(track(shaded, "shading", console=noise, disable=not noise.is_terminal))
     if sheet is not None:
         pictures.save(sheet, contact_sheet(rows[:24]))
     if as_json:
-        typer.echo(json.dumps(document(found, rows, variant)))
+        typer.echo(json.dumps(document(found, rows, variant, backend)))
         return
     shown = ("ssim", "psnr", "mae", "flip", "dssim", "trivial_dssim")
     listing = Table("scene", *shown)
@@ -129,7 +210,7 @@ def evaluate(
     listing.add_section()
     listing.add_row(f"mean of {len(rows)}", *(f"{mean[name]:.4f}" for name in shown))
     Console().print(listing)
-    typer.echo(f"DSSIM is {mean['ratio']:.3f} x the trivial answer's")
+    typer.echo(f"DSSIM is {mean['ratio']:.3f} x the trivial answer's, on {backend}")
 
 
 def export(

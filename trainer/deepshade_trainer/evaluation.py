@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from deepshade import metrics, pictures
 from deepshade.bundles import Bundle
+from deepshade.engines import REFERENCE, Backend, load_engine
 from deepshade.errors import ConfigError, DataError
+from deepshade.machine import cpu_count
 
 from .dataset import Dataset, Sample, rounded
 
@@ -59,21 +61,19 @@ class Row:
 
 
 class Shaded:
-    """A bundle in ONNX Runtime (CPU, fp32), as the service runs it."""
+    """A bundle on an engine, for G-buffers of any size."""
 
-    def __init__(self, bundle: Bundle) -> None:
-        import onnxruntime as ort
-
+    def __init__(self, bundle: Bundle, backend: Backend = REFERENCE) -> None:
         self.bundle = bundle
-        self.session = ort.InferenceSession(str(bundle.model), providers=["CPUExecutionProvider"])
+        self.backend = backend
+        self.engine = load_engine(bundle, backend, threads=cpu_count())
 
     def __call__(self, gbuffer: Image) -> Image:
         """Shade (C, H, W): zero-padded to the size multiple, cropped again."""
         height, width = gbuffer.shape[1:]
         step = self.bundle.size_multiple
         pad = ((0, 0), (0, -height % step), (0, -width % step))
-        whole = np.pad(gbuffer, pad)[None]
-        shaded: Image = self.session.run(None, {self.bundle.input_name: whole})[0][0]
+        shaded: Image = self.engine.predict(np.pad(gbuffer, pad)[None])[0]
         return shaded[:, :height, :width]
 
 
@@ -84,13 +84,15 @@ def evaluate(
     min_contrast: float = 0.12,
     limit: int | None = None,
     variant: Variant | None = None,
+    backend: Backend = REFERENCE,
 ) -> Iterator[Row]:
     """Shade every sample whose reference has at least `min_contrast` standard deviation.
 
     Raises:
         DataError: no sample has.
+        EngineError: this machine or this bundle lacks the backend.
     """
-    data, shader = Dataset(folders, bundle.effect), Shaded(bundle)
+    data, shader = Dataset(folders, bundle.effect), Shaded(bundle, backend)
     variant = variant or Variant()
     for name in variant.half:
         if name not in bundle.inputs:
@@ -166,11 +168,15 @@ def contact_sheet(rows: Sequence[Row], columns: int = 2) -> pictures.Picture:
     return pictures.below([pictures.beside(line) for line in lines])
 
 
-def document(bundle: Bundle, rows: Sequence[Row], variant: Variant) -> dict[str, Any]:
+def document(
+    bundle: Bundle, rows: Sequence[Row], variant: Variant, backend: Backend = REFERENCE
+) -> dict[str, Any]:
     """The whole evaluation as JSON."""
     return {
         "bundle": f"{bundle.effect}/{bundle.name}",
         "sha256": bundle.sha256,
+        "engine": backend.engine,
+        "precision": backend.precision,
         "inputs": asdict(variant),
         "mean": summary(rows),
         "views": table(rows),

@@ -16,13 +16,15 @@ from safetensors.torch import save
 from torch import Tensor
 
 from deepshade.attributes import ATTRIBUTES
-from deepshade.bundles import MODEL, WEIGHTS, Bundle, write_config
+from deepshade.bundles import INT8, MODEL, PROBE, WEIGHTS, Bundle, write_config
 from deepshade.effects import EFFECTS
 from deepshade.errors import DataError
 from deepshade.files import replacing
+from deepshade.probe import Window, write_probe
 
 from .dataset import Dataset
 from .networks import Shader, build
+from .quantisation import quantise
 from .recipe import Recipe
 from .run import Run
 
@@ -31,6 +33,8 @@ OPSET = 18
 # How far ONNX Runtime may stray from torch, both in float32, on values in [0, 1].
 TOLERANCE = 1e-4
 PARITY_SAMPLES = 8
+QUANTISATION_SAMPLES = 24
+PROBE_WINDOWS, PROBE_SIDE = 4, 256
 
 
 def load_shader(run: Run) -> tuple[Recipe, Shader]:
@@ -60,7 +64,9 @@ def export(
     """Write the bundle `folder` (its last two names are effect and name) from `run`.
 
     Returns it and the largest difference between ONNX Runtime and torch over real G-buffers of
-    `data`. `radius` is the effect radius, in scene units, of requests that name none.
+    `data`. `radius` is the effect radius, in scene units, of requests that name none. Beside the
+    graph comes its 8-bit version, quantised on training samples, and a probe from the validation
+    samples, on which a machine measures what each precision costs.
 
     Raises:
         DataError: the difference exceeds `TOLERANCE`; no configuration is then written.
@@ -68,17 +74,25 @@ def export(
     recipe, model = load_shader(run)
     effect = EFFECTS[recipe.effect]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.json").unlink(missing_ok=True)  # no bundle while its files change
+    for name in ("config.json", INT8, PROBE):  # no bundle while its files change
+        (folder / name).unlink(missing_ok=True)
     write_onnx(model, folder / MODEL)
     with replacing(folder / WEIGHTS) as temporary:
         tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
         temporary.write_bytes(save(tensors))
     samples = Dataset(data, recipe.effect)
-    chosen = np.linspace(0, len(samples.entries) - 1, PARITY_SAMPLES).astype(int)
-    gbuffers = [samples.batch([int(number)])[0] for number in chosen]
+    chosen = _spread(len(samples.entries), PARITY_SAMPLES)
+    gbuffers = [samples.batch([number])[0] for number in chosen]
     worst = parity(model, folder / MODEL, gbuffers)
     if not worst <= TOLERANCE:
         raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
+    training, held = samples.split(recipe.held_out)
+    some = [training[k] for k in _spread(len(training), QUANTISATION_SAMPLES)]
+    feeds = [samples.batch([number])[0].numpy() for number in some]
+    quantise(folder / MODEL, folder / INT8, INPUT, feeds)
+    windows = choose_probe(samples, held or training, model.size_multiple)
+    if windows:
+        write_probe(folder / PROBE, recipe.effect, windows)
     planes = torch.cat(gbuffers)
     ranges, start = {}, 0
     for name in effect.inputs:
@@ -100,8 +114,40 @@ def export(
         metrics={**(metrics or {}), "parity": {"onnxruntime_vs_torch_max": worst}},
         input_name=INPUT,
         output_name=OUTPUT,
+        background_halo=getattr(model, "background_halo", None),
     )
     return bundle, worst
+
+
+def choose_probe(samples: Dataset, numbers: Sequence[int], multiple: int) -> list[Window]:
+    """Windows of up to `PROBE_SIDE` pixels with something to see, at most one of each scene.
+
+    Precision is lost on positions that are large against the effect radius, so the windows run
+    from the smallest to the largest. Empty where samples are smaller than `multiple`.
+    """
+    found: dict[str, tuple[float, float, Window]] = {}
+    for number in numbers:
+        sample, record = samples.load(number), samples.entries[number].record
+        gbuffer, reference = samples.gbuffer(sample, record["radius"]), sample[samples.reference]
+        side = min(PROBE_SIDE, *reference.shape[1:]) // multiple * multiple
+        if side == 0:
+            continue
+        top, left = ((length - side) // 2 for length in reference.shape[1:])
+        inside = (slice(None), slice(top, top + side), slice(left, left + side))
+        window = np.ascontiguousarray(gbuffer[inside]), np.ascontiguousarray(reference[inside])
+        contrast = float(window[1].std())
+        if not found or contrast > found.get(record["scene"], (0.0,))[0]:
+            found[record["scene"]] = contrast, float(np.abs(window[0]).max()), window
+    side = max((window[0].shape[1] for _, _, window in found.values()), default=0)
+    alike = [entry for entry in found.values() if entry[2][0].shape[1] == side]
+    best = sorted(alike, key=lambda entry: -entry[0])[: max(PROBE_WINDOWS, len(alike) // 3)]
+    ordered = sorted(best, key=lambda entry: entry[1])
+    return [ordered[k][2] for k in _spread(len(ordered), PROBE_WINDOWS)]
+
+
+def _spread(length: int, count: int) -> list[int]:
+    """Up to `count` different numbers below `length`, evenly from first to last."""
+    return sorted({int(k) for k in np.linspace(0, length - 1, count)}) if length else []
 
 
 def write_onnx(model: Shader, path: Path) -> None:

@@ -1,0 +1,26 @@
+"""Running a bundle's network, on whichever engine and in whichever precision this machine has.
+
+    from deepshade.engines import available, load_engine
+
+    engine = load_engine(bundle, available()[0], threads=cpu_count())
+    engine.warm()
+    shade = engine.predict(gbuffer)  # (N, C, H, W) float32 to (N, C', H, W) float32
+
+Nothing heavy is imported before it is asked for.
+"""
+
+from deepshade.engines.base import Backend, Engine, busy
+from deepshade.engines.registry import REFERENCE, available, known, load_engine, usable
+from deepshade.errors import EngineError
+
+__all__ = [
+    "REFERENCE",
+    "Backend",
+    "Engine",
+    "EngineError",
+    "available",
+    "busy",
+    "known",
+    "load_engine",
+    "usable",
+]

@@ -1,0 +1,238 @@
+"""OpenVINO on the CPU, in the precisions that the CPU calculates natively.
+
+Three things here are measured rather than obvious:
+
+- In 16 bits the CPU plugin also rounds the arithmetic before the first convolution, such as the
+  difference between two large positions (DSSIM + 35 % with bf16 on real views). So the graph is
+  cut there: what comes before runs as a graph of its own in float32, the rest in 16 bits, and the
+  tensors between them are handed over without a copy. After the last convolution the plugin
+  returns to float32 by itself.
+- A graph of fixed size runs up to 1.5 times as fast as one with free height and width, because
+  elementwise steps are only fused then. But it takes a tenth of a second or more to compile. So a
+  size runs on the free graph until it has come several times, and then, as soon as that is
+  compiled in the background, on one of a few fixed ones.
+- The plugin keeps what it prepared for every size it has seen, without end, unless its cache is
+  off, and keeps a prediction's memory until told otherwise.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import cache
+from typing import Any, cast
+
+import numpy as np
+
+from deepshade.bundles import Bundle
+from deepshade.engines.base import Backend, Engine, Float
+from deepshade.engines.cutting import cut
+from deepshade.errors import EngineError
+
+_TYPES = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
+_CAPABILITIES = {"fp32": "FP32", "bf16": "BF16", "fp16": "FP16", "int8": "INT8"}
+# After how many predictions a size is compiled, how many of them are kept, and the input pixels
+# for which memory is kept, over all of them.
+_OFTEN = 8
+_SIZES = 6
+_LIVE_PIXELS = 4 * 2**20
+
+Shape = tuple[int, ...]
+
+
+def precisions(engine: str = "openvino") -> tuple[str, ...]:
+    """What this CPU does natively. Raises EngineError where OpenVINO isn't installed."""
+    known = _core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    return tuple(name for name, capability in _CAPABILITIES.items() if capability in known)
+
+
+def load(bundle: Bundle, backend: Backend, threads: int) -> Engine:
+    """See `deepshade.engines.load_engine`."""
+    return OpenVino(bundle, backend, threads=threads)
+
+
+class OpenVino(Engine):
+    """One bundle on OpenVINO. With n > 1 predictions at once each runs on threads/n threads."""
+
+    def __init__(self, bundle: Bundle, backend: Backend, *, threads: int) -> None:
+        super().__init__(bundle, backend, threads=threads)
+        graph = bundle.model
+        self._type = _TYPES.get(backend.precision, "f32")
+        if backend.precision == "int8" and bundle.int8 is not None:
+            graph = bundle.int8
+            # What isn't quantised runs in the CPU's own 16 bits, if it has them.
+            self._type = "bf16" if "bf16" in precisions() else "f32"
+        try:
+            self._model = _core().read_model(str(graph))
+        except RuntimeError as error:
+            raise EngineError(f"OpenVINO can't read {graph}: {_reason(error)}") from error
+        self._lock = threading.Lock()
+        self._free: dict[int, _Network] = {}  # by threads of a prediction
+        self._fixed: OrderedDict[tuple[Shape, int], _Network] = OrderedDict()
+        self._seen: OrderedDict[tuple[Shape, int], int] = OrderedDict()  # how often
+        self._pending: dict[tuple[Shape, int], Future[None]] = {}
+        self._network(None, threads)
+
+    def prepare(self, height: int, width: int) -> None:
+        """See `Engine.prepare`."""
+        shape = (1, self.channels, height, width)
+        for threads in {self.threads, 1}:
+            self._fix((shape, threads))
+
+    def shrink(self) -> None:
+        """See `Engine.shrink`."""
+        with self._lock:
+            networks = [*self._free.values(), *self._fixed.values()]
+        for network in networks:
+            network.release()
+
+    def _run(self, gbuffer: Float, threads: int) -> Float:
+        key = (gbuffer.shape, threads)
+        with self._lock:
+            network = self._fixed.get(key)
+            if network is not None:
+                self._fixed.move_to_end(key)
+            else:
+                self._seen[key] = self._seen.pop(key, 0) + 1
+                if self._seen[key] >= _OFTEN and key not in self._pending:
+                    self._pending[key] = _background.submit(self._fix, key)
+                if len(self._seen) > 64:
+                    self._seen.popitem(last=False)
+        if network is None:
+            network = self._network(None, threads)
+        shade = network.run(gbuffer)
+        self._bound(network)
+        return shade
+
+    def _fix(self, key: tuple[Shape, int]) -> None:
+        """Compile a size. One that fails stays on the free graph, and isn't tried again."""
+        shape, threads = key
+        with self._lock:
+            if key in self._fixed:
+                return
+        network = self._compile(shape, threads)
+        with self._lock:
+            self._fixed[key] = network
+            if len(self._fixed) > _SIZES:
+                self._fixed.popitem(last=False)
+            self._pending.pop(key, None)
+            free = self._free.get(threads)
+        if free is not None:
+            free.release()  # it won't be needed for this size again
+
+    def _network(self, shape: Shape | None, threads: int) -> _Network:
+        with self._lock:
+            if threads not in self._free:
+                self._free[threads] = self._compile(shape, threads)
+            return self._free[threads]
+
+    def _compile(self, shape: Shape | None, threads: int) -> _Network:
+        model = self._model.clone()
+        try:
+            if shape is not None:
+                model.reshape(list(shape))
+            exact, rest = (model, None) if self._type == "f32" else cut(model)
+            settings = {
+                "INFERENCE_NUM_THREADS": self.threads,
+                "NUM_STREAMS": max(1, self.threads // threads),
+                "ENABLE_CPU_PINNING": False,  # several graphs would be pinned to the same cores
+                "CPU_RUNTIME_CACHE_CAPACITY": "0",
+            }
+            return _Network(
+                [
+                    _core().compile_model(
+                        part, "CPU", {**settings, "INFERENCE_PRECISION_HINT": kind}
+                    )
+                    for part, kind in ((exact, "f32"), (rest, self._type))
+                    if part is not None
+                ]
+            )
+        except RuntimeError as error:
+            raise EngineError(
+                f"OpenVINO can't compile {self.bundle.effect}/{self.bundle.name} "
+                f"in {self.backend.precision}: {_reason(error)}"
+            ) from error
+
+    def _bound(self, latest: _Network) -> None:
+        """Release the memory of other sizes when together they hold too much."""
+        with self._lock:
+            others = [n for n in (*self._free.values(), *self._fixed.values()) if n is not latest]
+        room = _LIVE_PIXELS - latest.held
+        for network in reversed(others):
+            room -= network.held
+            if room < 0:
+                network.release()
+
+
+class _Network:
+    """One compiled graph, or two that follow each other, and requests to run them with.
+
+    The inputs of the second graph are the G-buffer, if it needs it, and after it what the first
+    graph puts out (see `cut`).
+    """
+
+    def __init__(self, graphs: list[Any]) -> None:
+        self.held = 0  # the largest prediction, in pixels, whose memory is still taken
+        self._graphs = graphs
+        self._idle: list[list[Any]] = []
+        self._lock = threading.Lock()
+
+    def run(self, gbuffer: Float) -> Float:
+        """(N, C, H, W) to (N, C', H, W)."""
+        from openvino import Tensor
+
+        given = Tensor(np.ascontiguousarray(gbuffer), shared_memory=True)
+        with self._requests() as requests:
+            handed: list[Any] = []
+            for graph, request in zip(self._graphs, requests, strict=True):
+                inputs = [given] * (len(graph.inputs) - len(handed)) + handed
+                for index, tensor in enumerate(inputs):
+                    request.set_input_tensor(index, tensor)
+                request.infer(share_outputs=True)  # else every tensor is copied for Python
+                handed = [request.get_output_tensor(k) for k in range(len(graph.outputs))]
+            self.held = max(self.held, gbuffer.size // gbuffer.shape[1])
+            return cast(Float, handed[0].data.copy())
+
+    def release(self) -> None:
+        """Give its memory back, unless it is running."""
+        if not self.held:
+            return
+        with self._lock:
+            self._idle.clear()
+        self.held = 0
+        for graph in self._graphs:
+            with suppress(RuntimeError):  # busy; it will be asked again
+                graph.release_memory()
+
+    @contextmanager
+    def _requests(self) -> Iterator[list[Any]]:
+        with self._lock:
+            requests = self._idle.pop() if self._idle else None
+        if requests is None:
+            requests = [graph.create_infer_request() for graph in self._graphs]
+        yield requests
+        with self._lock:
+            self._idle.append(requests)
+
+
+# One at a time, so that compiling never takes more than one core from what is being shaded.
+_background = ThreadPoolExecutor(1, thread_name_prefix="compile")
+
+
+@cache
+def _core() -> Any:
+    try:
+        from openvino import Core
+    except ImportError as error:
+        raise EngineError(
+            "OpenVINO is not installed", fix="pip install 'deepshade[service]' or openvino"
+        ) from error
+    return Core()
+
+
+def _reason(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1][:200] if lines else type(error).__name__

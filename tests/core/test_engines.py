@@ -1,0 +1,249 @@
+"""Every engine and precision of this machine, against closed forms and ONNX's own evaluator."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
+
+from deepshade.bundles import Bundle, write_config
+from deepshade.engines import (
+    REFERENCE,
+    Backend,
+    EngineError,
+    available,
+    busy,
+    known,
+    load_engine,
+    usable,
+)
+from deepshade.machine import resident
+
+# Of the values: rounding positions of 1000 in fp32, and the unit roundoffs of the others.
+TOLERANCE = {"fp32": 2**-12, "bf16": 2**-6, "fp16": 2**-9, "int8": 2**-5}
+HERE = [backend for backend in available() if backend.precision != "int8"]
+
+
+def graph(convolutions: int = 1) -> onnx.ModelProto:
+    """Slopes of the third position along x (its difference from the 4 x 4 mean), averaged.
+
+    mean = pool 4 x 4, enlarged; difference = 8 (z - mean); then `convolutions` of 3 x 3, each a
+    mean over nine neighbours.
+    """
+    constants = {
+        "start": np.array([5], np.int64),
+        "stop": np.array([6], np.int64),
+        "axis": np.array([1], np.int64),
+        "scales": np.array([1, 1, 4, 4], np.float32),
+        "eight": np.array(8, np.float32),
+        "kernel": np.full((1, 1, 3, 3), 1 / 9, np.float32),
+    }
+    nodes = [
+        helper.make_node("Slice", ["gbuffer", "start", "stop", "axis"], ["z"]),
+        helper.make_node("AveragePool", ["z"], ["mean"], kernel_shape=[4, 4], strides=[4, 4]),
+        helper.make_node("Resize", ["mean", "", "scales"], ["large"], mode="nearest"),
+        helper.make_node("Sub", ["z", "large"], ["offset"]),
+        helper.make_node("Mul", ["offset", "eight"], ["x0"]),
+    ]
+    for k in range(convolutions):
+        out = "shade" if k == convolutions - 1 else f"x{k + 1}"
+        nodes.append(helper.make_node("Conv", [f"x{k}", "kernel"], [out], pads=[1, 1, 1, 1]))
+    if not convolutions:
+        nodes.append(helper.make_node("Identity", ["x0"], ["shade"]))
+    made = helper.make_graph(
+        nodes,
+        "slopes",
+        [helper.make_tensor_value_info("gbuffer", TensorProto.FLOAT, ["N", 6, "H", "W"])],
+        [helper.make_tensor_value_info("shade", TensorProto.FLOAT, ["N", 1, "H", "W"])],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.checker.check_model(model)
+    return model
+
+
+def bundle(folder, model) -> Bundle:
+    folder.mkdir()
+    (folder / "model.onnx").write_bytes(model.SerializeToString())
+    (folder / "model.safetensors").write_bytes(b"\x02\0\0\0\0\0\0\0{}")
+    return write_config(
+        folder,
+        effect="ao",
+        name="slopes",
+        inputs=("normal", "position"),
+        outputs=("Y",),
+        radius=1.0,
+        fov=50.0,
+        size_multiple=4,
+        halo=8,
+    )
+
+
+@pytest.fixture(scope="module")
+def slopes(tmp_path_factory) -> Bundle:
+    return bundle(tmp_path_factory.mktemp("engines") / "slopes", graph())
+
+
+def far_away(height: int = 32, width: int = 48) -> np.ndarray:
+    """A rough surface about a thousand effect radii away."""
+    rng = np.random.default_rng(3)
+    gbuffer = rng.normal(size=(1, 6, height, width)).astype(np.float32)
+    gbuffer[:, 3:] -= 1000
+    return gbuffer
+
+
+def reference(model, gbuffer):
+    return ReferenceEvaluator(model).run(None, {"gbuffer": gbuffer})[0]
+
+
+@pytest.mark.parametrize("backend", HERE, ids=str)
+def test_large_positions_lose_nothing_in_16_bits(slopes, backend):
+    """bfloat16 holds 1000 to the nearest 4: were positions rounded, all slopes would be lost."""
+    engine = load_engine(slopes, backend, threads=2)
+    gbuffer = far_away()
+    expected = reference(graph(), gbuffer)
+    for _ in range(2):  # with a free size, then with one compiled for this size
+        shade = engine.predict(gbuffer)
+        assert np.abs(shade - expected).max() < TOLERANCE[backend.precision] * np.ptp(expected)
+        engine.prepare(32, 48)
+    assert shade.dtype == np.float32
+
+
+@pytest.mark.parametrize("convolutions", [0, 3])
+def test_graphs_without_and_with_several_convolutions(tmp_path, convolutions):
+    model, gbuffer = graph(convolutions), far_away()
+    expected = reference(model, gbuffer)
+    made = bundle(tmp_path / "b", model)
+    for backend in HERE:
+        shade = load_engine(made, backend, threads=1).predict(gbuffer)
+        assert np.abs(shade - expected).max() < TOLERANCE[backend.precision] * np.ptp(expected)
+
+
+@pytest.mark.parametrize("backend", HERE, ids=str)
+def test_any_size_and_batch(slopes, backend):
+    engine = load_engine(slopes, backend, threads=2)
+    for shape in ((1, 6, 4, 4), (3, 6, 8, 64), (1, 6, 64, 4), (1, 6, 8, 64)):
+        gbuffer = np.random.default_rng(1).normal(size=shape).astype(np.float32)
+        expected = reference(graph(), gbuffer)
+        assert np.abs(engine.predict(gbuffer) - expected).max() < 32 * TOLERANCE[backend.precision]
+    rotated = np.random.default_rng(2).normal(size=(1, 6, 8, 16)).astype(np.float32)
+    view = rotated.swapaxes(2, 3)  # not contiguous
+    expected = reference(graph(), np.ascontiguousarray(view))
+    assert np.abs(engine.predict(view) - expected).max() < 32 * TOLERANCE[backend.precision]
+
+
+@pytest.mark.parametrize("backend", HERE, ids=str)
+def test_many_threads_at_once(slopes, backend):
+    engine = load_engine(slopes, backend, threads=2)
+    pictures = [far_away(8 + 4 * k, 16) + k for k in range(6)]
+    expected = [engine.predict(picture).copy() for picture in pictures]
+    wrong = []
+
+    def work(k):
+        for _ in range(10):
+            if np.abs(engine.predict(pictures[k]) - expected[k]).max() > 1e-2:
+                wrong.append(k)
+            engine.shrink()
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_predictions_at_once_share_the_threads(slopes, monkeypatch):
+    engine = load_engine(slopes, REFERENCE, threads=4)
+    given: list[int] = []
+    together = threading.Barrier(2)
+
+    def run(gbuffer, threads):
+        given.append(threads)
+        together.wait(10)
+        return gbuffer
+
+    monkeypatch.setattr(engine, "_run", run)
+    with busy() as alone:
+        assert alone == 1
+        with busy() as still:  # the same work
+            assert still == 1
+        other = threading.Thread(target=engine.predict, args=(far_away(),))
+        other.start()
+        engine.predict(far_away())
+        other.join()
+    assert given[0] == 2  # the other one, which came second
+    with busy() as alone:
+        assert alone == 1
+
+
+def test_what_is_not_there_says_how_to_get_it(slopes, monkeypatch):
+    with pytest.raises(EngineError, match="no engine 'openvin'") as caught:
+        load_engine(slopes, Backend("openvin", "fp32"), threads=1)
+    assert "openvino" in caught.value.fix
+    with pytest.raises(EngineError, match="no precision 'fp64'"):
+        load_engine(slopes, Backend("onnxruntime", "fp64"), threads=1)
+    with pytest.raises(EngineError, match="no int8 graph"):
+        load_engine(slopes, Backend("onnxruntime", "int8"), threads=1)
+    if not any(backend.engine == "cuda" for backend in available()):
+        with pytest.raises(EngineError) as caught:
+            load_engine(slopes, Backend("cuda", "fp32"), threads=1)
+    assert set(usable(slopes)) == set(HERE)
+    assert set(available()) <= set(known())
+    assert available()[0] == REFERENCE
+
+
+def test_a_graph_that_cannot_be_read(tmp_path):
+    made = bundle(tmp_path / "b", graph())
+    made.model.write_bytes(b"no graph")
+    for backend in {one.engine: one for one in HERE}.values():
+        with pytest.raises(EngineError):
+            load_engine(made, backend, threads=1)
+
+
+@pytest.mark.skipif(Backend("openvino", "fp32") not in HERE, reason="OpenVINO isn't installed")
+def test_a_size_that_comes_often_is_compiled_aside(slopes):
+    engine = load_engine(slopes, Backend("openvino", "fp32"), threads=1)
+    gbuffer = far_away()
+    expected = engine.predict(gbuffer)
+    compile_, compiled = engine._compile, []
+    engine._compile = lambda shape, threads: compiled.append(shape) or compile_(shape, threads)
+    for _ in range(30):
+        assert np.abs(engine.predict(gbuffer) - expected).max() < 1e-2
+        for waiting in list(engine._pending.values()):
+            waiting.result(30)
+    assert compiled == [gbuffer.shape]  # once, and not for the sizes that came once
+    for height in range(4, 200, 4):
+        engine.predict(far_away(height, 4))
+    assert len(compiled) == 1
+
+
+@pytest.mark.slow
+def test_nothing_heavy_is_imported_early():
+    code = (
+        "import sys, deepshade.engines; "
+        "sys.exit(bool({'onnxruntime', 'openvino', 'torch'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", HERE, ids=str)
+def test_memory_stays_flat_over_changing_sizes(slopes, backend):
+    engine = load_engine(slopes, backend, threads=2)
+    engine.warm()
+    rng = np.random.default_rng(0)
+    levels = []
+    for _ in range(3):
+        for _ in range(40):
+            height, width = 4 * rng.integers(1, 120, 2)
+            engine.predict(np.zeros((1, 6, height, width), np.float32))
+        engine.shrink()
+        levels.append(resident())
+    assert levels[2] - levels[0] < 32 * 2**20
