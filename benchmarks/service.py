@@ -25,13 +25,16 @@ import numpy as np
 import uvicorn
 
 from deepshade import exr
+from deepshade.effects import EFFECTS
 from deepshade.machine import cpu_count, describe
 from deepshade_client import answer
 from deepshade_service import shading
 from deepshade_service.app import Service, create_app
+from deepshade_service.choice import Choices
 from deepshade_service.cli import listen
 from deepshade_service.config import Settings
 from deepshade_service.parameters import ShadeParameters
+from deepshade_service.planner import Scene
 from deepshade_service.uploads import Upload
 
 TARGET = 1.5
@@ -74,15 +77,18 @@ def measure(
     """Times `rounds` pairs of a bare prediction and a request; all times in milliseconds."""
     while client.get("/readyz").status_code != 200:
         time.sleep(0.05)
-    engine = service.models.pick(effect)
+    chosen = Choices.of(service.models, effect, ShadeParameters()).plain
+    engine = service.models.engine(chosen)
     limits = service.settings.limits
     headers = [exr.read_header(body, limits)]
-    gbuffer = shading.decode([Upload("", "", body)], headers, engine, ShadeParameters(), limits)
-    plan = shading.plan(gbuffer, engine, ShadeParameters(), service.settings.memory)
+    gbuffer = shading.decode(
+        [Upload("", "", body)], headers, engine.bundle, ShadeParameters(), limits
+    )
+    scene = Scene(gbuffer, EFFECTS[effect])
+    plan = scene.plan(engine.bundle, ShadeParameters(), service.settings.memory)
     if len(plan.tiling) != 1:
-        raise SystemExit("the picture doesn't fit into one tile: give the service more memory")
-    planes, _ = next(shading.passes(gbuffer, engine, plan.radius, np.empty((3, *gbuffer.shape))))
-    ready = shading.cut(planes, next(iter(plan.tiling)))
+        raise SystemExit("the picture is no single tile: take one that is covered, or smaller")
+    ready = shading.first_input(gbuffer, plan, engine.bundle)
 
     times: dict[str, list[float]] = {
         name: [] for name in ("network", "service", "transport", *STAGES)
@@ -115,7 +121,7 @@ def measure(
     return {
         "machine": describe(),
         "bundle": f"{effect}/{engine.bundle.name} {engine.bundle.short_hash}",
-        "engine": f"{engine.name} {engine.precision}, {service.settings.threads} threads",
+        "engine": f"{engine.backend}, {service.settings.threads} threads",
         "picture": f"{width}x{height}, {len(body):,} bytes",
         "rounds": rounds,
         "milliseconds": {name: spread(values) for name, values in times.items()},

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,9 @@ import pytest
 # A shell's background job ignores Ctrl-C, and so would every command that a test interrupts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# No test may fill, or depend on, what this machine's services keep.
+os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="deepshade-tests-")
 
 ROOT = Path(__file__).parent.parent
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +40,20 @@ class Answer:
         with replacing(target) as temporary:
             temporary.write_bytes(self.content)
         return target
+
+    def plan(self) -> dict[str, Any]:
+        """How it was made, and why, as the EXR's header says; {} if it doesn't (as in a PNG).
+
+        The same as `Client.explain` gives. Raises BadAnswer when the file is damaged.
+        """
+        if self.media_type != "image/x-exr":
+            return {}
+        try:
+            part = exr.read_header(self.content).parts[0]
+            plan = json.loads(part.attributes.get("deepshade:plan", "{}"))
+        except (ImageError, ValueError) as error:
+            raise BadAnswer(f"the answer's header can't be read: {error}") from error
+        return plan if isinstance(plan, dict) else {}
 
     def channels(self) -> dict[str, NDArray[np.float32]]:
         """The decoded EXR: (H, W) float32 under "Y", or "R", "G" and "B".

@@ -42,6 +42,17 @@ class Result:
     error: Exception | None = None
 
 
+def views(inputs: Sequence[str], *, together: bool = False) -> list[tuple[Path, ...]]:
+    """The files of every view that `inputs` name, as in `plan`. Raises UsageError."""
+    found = list(_find(inputs, None))
+    return [tuple(found)] if together else [(path,) for path in found]
+
+
+def together_or_one(sources: tuple[Path, ...]) -> Path | tuple[Path, ...]:
+    """What the client takes as a picture: several files of a view, or its only one."""
+    return sources if len(sources) > 1 else sources[0]
+
+
 def plan(
     inputs: Sequence[str], out: str, *, effect: str, suffix: str, together: bool = False
 ) -> list[Task]:
@@ -100,8 +111,7 @@ async def run(
             answer: Answer | None = None
             failure: Exception | None = None
             try:
-                picture = task.sources if len(task.sources) > 1 else task.sources[0]
-                answer = await client.shade(effect, picture, options)
+                answer = await client.shade(effect, together_or_one(task.sources), options)
                 await asyncio.to_thread(_save, answer, task.target)
             except (ClientError, OSError) as error:
                 failure = error

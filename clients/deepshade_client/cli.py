@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from enum import StrEnum
 from typing import Annotated, Any
 
 import typer
@@ -16,6 +17,24 @@ import typer
 from deepshade.cli import run
 from deepshade_client.exceptions import ClientError, NotReady, TransportError
 from deepshade_client.settings import DEFAULT_SERVER
+
+
+class Quality(StrEnum):
+    """What `--quality` may be."""
+
+    fast = "fast"
+    balanced = "balanced"
+    best = "best"
+
+
+class Precision(StrEnum):
+    """What `--precision` may be."""
+
+    fp32 = "fp32"
+    bf16 = "bf16"
+    fp16 = "fp16"
+    int8 = "int8"
+
 
 app = typer.Typer(
     help="Shade G-buffers through a running deepshade service.",
@@ -38,13 +57,13 @@ def shade(
         list[str], typer.Argument(metavar="IN...", help="EXR files, folders, glob patterns.")
     ],
     out: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--out",
             "-o",
             help="A file, a folder, or a pattern with {name} and {effect}.",
         ),
-    ],
+    ] = None,
     radius: Annotated[float | None, typer.Option(help="Effect radius, scene units.")] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
     map_: Annotated[
@@ -53,6 +72,24 @@ def shade(
     ] = None,
     profile: Annotated[str | None, typer.Option(help="Renderer whose names to expect.")] = None,
     bundle: Annotated[str | None, typer.Option(help="Which of the effect's bundles.")] = None,
+    quality: Annotated[
+        Quality | None, typer.Option(help="The bundle of that name.", case_sensitive=False)
+    ] = None,
+    max_error: Annotated[
+        float | None,
+        typer.Option(help="The fastest bundle with at most this error (DSSIM)."),
+    ] = None,
+    budget_ms: Annotated[
+        float | None,
+        typer.Option(help="The most accurate bundle whose network takes at most so long."),
+    ] = None,
+    engine: Annotated[str | None, typer.Option(help="What it must run on, as openvino.")] = None,
+    precision: Annotated[
+        Precision | None, typer.Option(help="How exactly it must calculate.")
+    ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Print the plan as JSON; shade and save nothing.")
+    ] = False,
     png: Annotated[bool, typer.Option("--png", help="8-bit PNG instead of EXR.")] = False,
     compression: Annotated[str | None, typer.Option(help="Of the EXR, as zip or piz.")] = None,
     full: Annotated[bool, typer.Option("--float", help="32-bit pixels instead of 16.")] = False,
@@ -65,30 +102,49 @@ def shade(
     server: Server = DEFAULT_SERVER,
     as_json: AsJson = False,
 ) -> None:
-    """Shade pictures and save the answers."""
+    """Shade pictures and save the answers; or, with --explain, say how that would be done."""
     from deepshade.channels import parse_mapping
     from deepshade_client import batch, report
-    from deepshade_client.client import AsyncClient
+    from deepshade_client.client import AsyncClient, Client
     from deepshade_client.request import Options
     from deepshade_client.settings import Retry, Timeout
 
-    png = png or out.lower().endswith(".png")
-    tasks = batch.plan(
-        inputs, out, effect=effect, suffix=".png" if png else ".exr", together=together
-    )
+    png = png or (out or "").lower().endswith(".png")
     options = Options(
         radius=radius,
         fov=fov,
         profile=profile,
         mapping=parse_mapping(map_ or []),
         bundle=bundle,
+        quality=quality.value if quality else None,
+        max_error=max_error,
+        budget_ms=budget_ms,
+        engine=engine,
+        precision=precision.value if precision else None,
         format="png" if png else "exr",
         compression=compression,
         half=False if full else None,
     )
 
+    retry, wait = Retry(attempts=retries + 1), Timeout(answer=timeout)
+    if explain:
+        with Client(server, retry=retry, timeout=wait) as client:
+            plans = [
+                {
+                    "input": [str(path) for path in view],
+                    "plan": client.explain(effect, batch.together_or_one(view), options),
+                }
+                for view in batch.views(inputs, together=together)
+            ]
+        _print_json({"pictures": plans})
+        return
+    if out is None:
+        raise batch.UsageError("where shall the answers go?", "name a file or folder: --out")
+    tasks = batch.plan(
+        inputs, out, effect=effect, suffix=".png" if png else ".exr", together=together
+    )
+
     async def shade_all() -> list[batch.Result]:
-        retry, wait = Retry(attempts=retries + 1), Timeout(answer=timeout)
         async with AsyncClient(server, retry=retry, timeout=wait) as client:
             with report.progress(len(tasks), quiet=as_json) as done:
                 return await batch.run(client, effect, tasks, options, jobs=jobs, done=done)

@@ -16,6 +16,7 @@ from deepshade_client.request import (
     Options,
     Picture,
     base_url,
+    explain_request,
     get_request,
     read_answer,
     read_effects,
@@ -57,6 +58,16 @@ class Client:
         Also raises OSError for a file that can't be read.
         """
         return self._ask(shade_request(effect, picture, options or Options()), read_answer)
+
+    def explain(
+        self, effect: str, picture: Picture, options: Options | None = None
+    ) -> dict[str, Any]:
+        """How the service would shade a picture, and why: its plan, without shading it.
+
+        Which bundle on which engine, what of the picture would be computed, which channels are
+        read; docs/service.md has an example. Also raises OSError for a file that can't be read.
+        """
+        return self._ask(explain_request(effect, picture, options or Options()), read_object)
 
     def effects(self) -> list[dict[str, Any]]:
         """Every effect: name, title, inputs, outputs, and its bundles."""
@@ -124,6 +135,13 @@ class AsyncClient:
         """Like `Client.shade`; files are read in a thread."""
         request = await asyncio.to_thread(shade_request, effect, picture, options or Options())
         return await self._ask(request, read_answer)
+
+    async def explain(
+        self, effect: str, picture: Picture, options: Options | None = None
+    ) -> dict[str, Any]:
+        """Like `Client.explain`; files are read in a thread."""
+        request = await asyncio.to_thread(explain_request, effect, picture, options or Options())
+        return await self._ask(request, read_object)
 
     async def effects(self) -> list[dict[str, Any]]:
         """Like `Client.effects`."""

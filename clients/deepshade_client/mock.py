@@ -71,6 +71,8 @@ class MockTransport(httpx.BaseTransport, httpx.AsyncBaseTransport):
         except DeepshadeError as error:
             status, kind = kind_of(error)
             return _problem(status, kind, str(error), fix=error.fix, **facts_of(error))
+        if query.get("explain") in ("true", "1"):
+            return httpx.Response(200, json=_plan(effect, gbuffer, radius))
         shade = np.asarray(self._shade(gbuffer), np.float32)
         planes = shade.reshape(-1, *shade.shape[-2:])
         if query.get("format") == "png":
@@ -119,6 +121,19 @@ def _number(query: httpx.QueryParams, name: str, below: float = math.inf) -> flo
     if not 0 < value < below:
         raise ConfigError(name, detail=f"query.{name}: '{query[name]:.100}' is out of range")
     return value
+
+
+def _plan(effect: str, gbuffer: GBuffer, radius: float) -> dict[str, Any]:
+    height, width = gbuffer.shape
+    background = int(gbuffer.background.sum())
+    pixels = {"width": width, "height": height, "all": width * height, "background": background}
+    return {
+        "effect": effect,
+        "reason": "it is the only one",
+        "bundle": "mock",
+        "radius": radius,
+        "pixels": pixels | {"computed": width * height, "share": 1.0, "tiles": 1},
+    }
 
 
 def _described(name: str) -> dict[str, Any]:

@@ -64,11 +64,17 @@ def print_effects(effects: Sequence[dict[str, Any]]) -> None:
 
 def print_models(models: Sequence[dict[str, Any]]) -> None:
     """A table of bundles."""
-    table = Table("effect", "bundle", "radius", "engine", "precision", "sha256")
+    table = Table("effect", "bundle", "radius", "engine", "precision", "dssim", "sha256")
     for model in models:
-        cells = ("effect", "name", "radius", "engine", "precision", "sha256")
-        table.add_row(*(escape(str(model.get(cell, ""))[:16]) for cell in cells))
+        cells = ("effect", "name", "radius", "engine", "precision", "dssim", "sha256")
+        table.add_row(*(escape(_cell(model.get(cell))) for cell in cells))
     Console().print(table)
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)[:16]
 
 
 def _line(result: Result) -> str:

@@ -36,6 +36,10 @@ class Options:
 
     `radius` is in scene units, `fov` the full horizontal angle in degrees, `mapping` says which
     layer or comma-separated channels hold an attribute, `half` asks for 16-bit pixels.
+
+    What shades: `quality` ("fast", "balanced", "best") or `bundle` by name; `max_error` (DSSIM)
+    asks for the fastest within an error, `budget_ms` for the most accurate within a time of the
+    network; `engine` ("openvino") and `precision` ("bf16") pin how it runs.
     """
 
     radius: float | None = None
@@ -43,6 +47,11 @@ class Options:
     profile: str | None = None
     mapping: Mapping[str, str] | None = None
     bundle: str | None = None
+    quality: str | None = None
+    max_error: float | None = None
+    budget_ms: float | None = None
+    engine: str | None = None
+    precision: str | None = None
     format: Literal["exr", "png"] = "exr"
     compression: str | None = None
     half: bool | None = None
@@ -50,10 +59,15 @@ class Options:
     def query(self) -> list[tuple[str, str]]:
         """As the parameters of the request."""
         plain = {
-            "radius": None if self.radius is None else repr(float(self.radius)),
-            "fov": None if self.fov is None else repr(float(self.fov)),
+            "radius": _number(self.radius),
+            "fov": _number(self.fov),
             "profile": self.profile,
             "bundle": self.bundle,
+            "quality": self.quality,
+            "max_error": _number(self.max_error),
+            "budget_ms": _number(self.budget_ms),
+            "engine": self.engine,
+            "precision": self.precision,
             "format": None if self.format == "exr" else self.format,
             "compression": self.compression,
             "half": None if self.half is None else str(self.half).lower(),
@@ -78,6 +92,12 @@ def shade_request(effect: str, picture: Picture, options: Options) -> dict[str, 
     named = picture.items() if isinstance(picture, Mapping) else [("image", s) for s in picture]
     files = [(field, (*_named(source), EXR)) for field, source in named]
     return request | {"files": files}
+
+
+def explain_request(effect: str, picture: Picture, options: Options) -> dict[str, Any]:
+    """The same for its plan: `shade_request`, but nothing is to be shaded."""
+    request = shade_request(effect, picture, options)
+    return request | {"params": [*request["params"], ("explain", "true")]}
 
 
 def read_answer(response: httpx.Response) -> Answer:
@@ -130,6 +150,10 @@ def read_object(response: httpx.Response) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise BadAnswer("the answer is no JSON object; is this a deepshade service?")
     return document
+
+
+def _number(value: float | None) -> str | None:
+    return None if value is None else repr(float(value))
 
 
 def _json(response: httpx.Response) -> Any:

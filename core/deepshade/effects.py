@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from deepshade.attributes import ATTRIBUTES
+from deepshade.relevance import Rule, no_occluder
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +16,8 @@ class Effect:
     `inputs` are attribute names in network order. A `per_channel` effect is one network, trained
     on one channel, run on each of its colour channels; `outputs` are the answer's EXR channels.
     `background` is the answer where there is no geometry. `picture` is how 8-bit pictures show it:
-    light goes through sRGB's curve, a factor such as occlusion does not.
+    light goes through sRGB's curve, a factor such as occlusion does not. `open_rule` tells the
+    pixels whose answer is known without the network (`deepshade.relevance`), None without such.
     """
 
     name: str
@@ -26,6 +28,7 @@ class Effect:
     background: float
     reference: str
     picture: Literal["linear", "srgb"] = "srgb"
+    open_rule: Rule | None = None
 
 
 _Y = ("Y",)
@@ -41,6 +44,7 @@ _TABLE = (
         background=1.0,
         reference="(1/π)∫ V_R cosθ dω; 1 = open",
         picture="linear",
+        open_rule=no_occluder,
     ),
     Effect(
         "do",

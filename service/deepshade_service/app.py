@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager, suppress
@@ -14,15 +15,16 @@ from fastapi import FastAPI, Query, Request, Response
 from fastapi.responses import HTMLResponse, PlainTextResponse
 
 from deepshade.attributes import ATTRIBUTES
+from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade_service import problems
+from deepshade_service.choice import Choices
 from deepshade_service.config import Settings
-from deepshade_service.engine import Engine
 from deepshade_service.job import Answer, Job
 from deepshade_service.memory import MemoryBudget, trim
 from deepshade_service.middleware import Closing, Counting
-from deepshade_service.models import Models, find_effect, not_ready
+from deepshade_service.models import Candidate, Models, find_effect, not_ready
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.pool import Cancelled, Workers
 from deepshade_service.telemetry import MEDIA_TYPE as METRICS_TYPE
@@ -35,7 +37,9 @@ class Service:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.models = Models(settings.models, threads=settings.threads)
+        self.models = Models(
+            settings.models, threads=settings.threads, calibration=settings.calibration
+        )
         self.workers = Workers(settings.workers, settings.queue)
         self.uploads = Uploads(settings)
         self.memory = MemoryBudget(settings.memory)
@@ -45,14 +49,24 @@ class Service:
 
     @asynccontextmanager
     async def running(self, app: FastAPI) -> AsyncIterator[None]:
-        """Load models in the background, so that /healthz answers meanwhile; stop in the end."""
+        """Load models in the background, so that /healthz answers meanwhile; stop in the end.
+
+        Once they are loaded the machine is calibrated, in the background too.
+        """
+        stopping = threading.Event()
+
+        def prepare() -> None:
+            self.models.load()
+            self.models.calibrate(stopping)
+
         tasks = [
-            asyncio.create_task(asyncio.to_thread(self.models.load)),
+            asyncio.create_task(asyncio.to_thread(prepare)),
             asyncio.create_task(self._tidy()),
         ]
         try:
             yield
         finally:
+            stopping.set()
             for task in tasks:
                 task.cancel()
             await asyncio.to_thread(self.workers.stop)
@@ -60,14 +74,19 @@ class Service:
 
     async def shade(self, effect: str, request: Request, asked: ShadeParameters) -> Answer:
         """Receive, queue and shade one picture."""
-        engine = self.models.pick(effect, asked.bundle)
+        choices = Choices.of(self.models, effect, asked)
         self.workers.check_room()  # before the body is received, to spare both sides the work
         async with self.uploads.receive(request) as uploads:
-            job = Job(engine, uploads, asked, self.settings.limits, self.memory)
+            job = Job(choices, self.models.engine, uploads, self.settings.limits, self.memory)
             answer = await _unless_gone(request, self.workers.run(job))
-        self.telemetry.shaded(
-            effect, answer.watch, answer.pixels, int(answer.facts["nonfinite_pixels"])
-        )
+        if not asked.explain:
+            self.telemetry.shaded(
+                effect,
+                answer.watch,
+                answer.pixels,
+                answer.computed,
+                int(answer.facts["nonfinite_pixels"]),
+            )
         return answer
 
     async def _tidy(self) -> None:
@@ -115,7 +134,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         """Send one EXR as the body, or one or several as the files of a form.
 
         Takes any size from 1x1 up. Pixels that aren't finite are background. The answer's
-        headers, and its EXR header, say how it was made.
+        headers, and its EXR header, say how it was made. With `explain=1` the answer is the plan
+        as JSON: which bundle on which engine and why, what of the picture would be computed, and
+        which channels were decoded for it.
         """
         try:
             answer = await service.shade(effect, request, asked)
@@ -127,11 +148,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     @app.get("/effects", tags=["effects"], summary="All effects and their bundles")
     async def effects() -> list[dict[str, Any]]:
-        return [_effect(name, service.models.bundles(name)) for name in EFFECTS]
+        return [_effect(name, service.models) for name in EFFECTS]
 
     @app.get("/effects/{effect}", tags=["effects"], summary="One effect: inputs, bundles, metrics")
     async def one_effect(effect: str) -> dict[str, Any]:
-        return _effect(find_effect(effect).name, service.models.bundles(effect))
+        return _effect(find_effect(effect).name, service.models)
 
     @app.get("/healthz", tags=["operation"], summary="Is the process alive?")
     async def healthz() -> dict[str, str]:
@@ -141,8 +162,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def readyz() -> dict[str, Any]:
         if not service.models.ready:
             raise not_ready(service.models)
-        bundles = [f"{engine.bundle.effect}/{engine.bundle.name}" for engine in service.models]
-        return {"status": "ready", "bundles": bundles, "refused": service.models.refused}
+        models = service.models
+        bundles = [f"{name}/{bundle.name}" for name in EFFECTS for bundle in models.bundles(name)]
+        return {
+            "status": "ready",
+            "bundles": bundles,
+            "refused": models.refused,
+            "calibrating": models.calibrating,
+        }
 
     @app.get("/metrics", tags=["operation"], summary="Counters, for Prometheus")
     async def metrics() -> Response:
@@ -178,8 +205,10 @@ async def _gone(request: Request) -> None:
         pass
 
 
-def _effect(name: str, engines: list[Engine]) -> dict[str, Any]:
+def _effect(name: str, models: Models) -> dict[str, Any]:
     effect = EFFECTS[name]
+    bundles = models.bundles(name)
+    candidates = models.candidates(name) if bundles else []
     return {
         "name": name,
         "title": effect.title,
@@ -189,12 +218,15 @@ def _effect(name: str, engines: list[Engine]) -> dict[str, Any]:
         ],
         "outputs": effect.outputs,
         "reference": effect.reference,
-        "bundles": [_bundle(engine) for engine in engines],
+        "bundles": [
+            _bundle(bundle, [c for c in candidates if c.bundle.name == bundle.name])
+            for bundle in bundles
+        ],
     }
 
 
-def _bundle(engine: Engine) -> dict[str, Any]:
-    bundle = engine.bundle
+def _bundle(bundle: Bundle, candidates: list[Candidate]) -> dict[str, Any]:
+    default = next(candidate for candidate in candidates if candidate.default)
     return {
         "name": bundle.name,
         "sha256": bundle.sha256,
@@ -202,8 +234,23 @@ def _bundle(engine: Engine) -> dict[str, Any]:
         "radius": bundle.radius,
         "size_multiple": bundle.size_multiple,
         "halo": bundle.halo,
-        "engine": engine.name,
-        "precision": engine.precision,
+        "background_halo": bundle.background_halo,
+        "engine": default.backend.engine,
+        "precision": default.backend.precision,
+        "dssim": default.dssim,
+        "backends": [
+            {
+                "engine": candidate.backend.engine,
+                "precision": candidate.backend.precision,
+                "dssim": candidate.dssim,
+                "added": candidate.added,
+                "fixed_ms": candidate.fixed_ms,
+                "ms_per_megapixel": candidate.ms_per_megapixel,
+                "calibrated": candidate.calibrated,
+                "default": candidate.default,
+            }
+            for candidate in candidates
+        ],
         "metrics": bundle.metrics,
     }
 
@@ -247,7 +294,11 @@ _PROBLEM = {
 _SHADE_RESPONSES: dict[int | str, Any] = {
     200: {
         "description": "The shaded picture",
-        "content": {"image/x-exr": _BINARY, "image/png": _BINARY},
+        "content": {
+            "image/x-exr": _BINARY,
+            "image/png": _BINARY,
+            "application/json": {"schema": {"type": "object", "description": "With explain=1"}},
+        },
     }
 }
 _SHADE_RESPONSES |= {

@@ -34,6 +34,14 @@ def serve(
             " the models that came with the sources."
         ),
     ] = None,
+    calibration: Annotated[
+        str,
+        typer.Option(
+            help="File with what each engine and precision takes and costs here, measured in the"
+            " background where it says nothing; 'off' measures nothing and stays in fp32."
+            " Default: calibration.json in $XDG_CACHE_HOME/deepshade."
+        ),
+    ] = "",
     threads: Annotated[
         int | None, typer.Option(min=1, help="Of a network run. Default: the CPUs we may use.")
     ] = None,
@@ -66,6 +74,7 @@ def serve(
 
     from deepshade.bundles import bundle_root
     from deepshade.errors import ConfigError
+    from deepshade_service.calibration import chosen_path
     from deepshade_service.config import Settings, default_limits
     from deepshade_service.memory import parse_size
 
@@ -85,6 +94,7 @@ def serve(
     chosen = {"threads": threads, "memory": parse_size(memory) if memory else None}
     settings = Settings(
         models=models,
+        calibration=chosen_path(calibration),
         limits=replace(
             default_limits(uploads),
             **{name: value for name, value in limits.items() if value is not None},

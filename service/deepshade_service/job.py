@@ -2,102 +2,137 @@
 
 from __future__ import annotations
 
+import json
 import threading
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from math import prod
+from typing import TYPE_CHECKING
 
 from deepshade import exr
-from deepshade.errors import LimitError
+from deepshade.effects import EFFECTS
+from deepshade.engines import Engine, busy
 from deepshade_service import shading
-from deepshade_service.engine import Engine
+from deepshade_service.choice import Choice, Choices
 from deepshade_service.memory import MemoryBudget, trim
-from deepshade_service.parameters import ShadeParameters
+from deepshade_service.planner import Plan, Scene, explain
 from deepshade_service.pool import Cancelled
+from deepshade_service.room import Room, bytes_per_pixel, room_for, size_of
 from deepshade_service.telemetry import Stopwatch
-from deepshade_service.tiles import padded, smallest_tile
 from deepshade_service.uploads import Upload
+
+if TYPE_CHECKING:
+    from deepshade_service.models import Candidate
 
 # Work that used more hands memory back at once, other work when the service is idle.
 _BIG = 512 * 2**20
-# What one request may take of the memory, so that small ones still run beside a big one.
-_SHARE = 0.75
+# How much more memory for each pixel the engine that is chosen in the end may take.
+_SPARE = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """An encoded picture, and how it was made."""
+    """An encoded picture, or a plan as JSON, and how it was made."""
 
     content: bytes
     media_type: str
     facts: shading.Facts
     pixels: int
+    computed: int
     watch: Stopwatch
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What one request asks for; call it on a worker thread."""
+    """What one request asks for; call it on a worker thread.
 
-    engine: Engine
+    `choices` is what the request leaves open of bundle and backend, `load` gives an engine.
+    """
+
+    choices: Choices
+    load: Callable[[Candidate], Engine]
     files: list[Upload]
-    asked: ShadeParameters
     limits: exr.Limits
     memory: MemoryBudget
 
     def __call__(self, cancelled: threading.Event) -> Answer:
-        """Shade the picture. Raises what the four steps raise, and Cancelled."""
+        """Shade the picture. Raises what its steps raise, and Cancelled."""
         watch = Stopwatch()
         with watch.time("decode"):
             headers = [exr.read_header(file.data, self.limits) for file in self.files]
-        needed, tile_bytes = self._memory(headers)
-        with self.memory.hold(needed, cancelled):
+        choice = self._first(headers)
+        engine = self.load(choice.candidate)
+        spare = _SPARE if self.choices.open else 1
+        room = room_for(headers, engine, self.memory.total, spare=spare)
+        with self.memory.hold(room.needed, cancelled):
             if cancelled.is_set():
                 raise Cancelled
             try:
-                return self._shade(headers, tile_bytes, watch, cancelled)
+                with busy():
+                    return self._shade(headers, choice, engine, room, watch, cancelled)
             finally:
-                if needed > _BIG:
-                    self.engine.shrink()
+                if room.needed > _BIG:
+                    engine.shrink()
                     trim()
+
+    def _first(self, headers: list[exr.Header]) -> Choice:
+        """The choice before anything is decoded: all of the picture may have to be computed."""
+        return self.choices.first(prod(size_of(headers)))
 
     def _shade(
         self,
         headers: list[exr.Header],
-        tile_bytes: int,
+        choice: Choice,
+        engine: Engine,
+        room: Room,
         watch: Stopwatch,
         cancelled: threading.Event,
     ) -> Answer:
+        asked = self.choices.asked
         with watch.time("decode"):
-            gbuffer = shading.decode(self.files, headers, self.engine, self.asked, self.limits)
+            gbuffer = shading.decode(self.files, headers, engine.bundle, asked, self.limits)
         with watch.time("plan"):
-            plan = shading.plan(gbuffer, self.engine, self.asked, tile_bytes)
+            scene = Scene(gbuffer, EFFECTS[engine.bundle.effect])
+            if self.choices.open:
+                choice, engine = self._final(scene, choice, engine, room)
+            plan = scene.plan(engine.bundle, asked, room.max_pixels(engine))
+            made = explain(scene, plan, choice, self.choices, engine, room, headers)
+            facts = shading.describe(gbuffer, plan, engine, made)
+        if asked.explain:
+            content = json.dumps(made, indent=2).encode()
+            return Answer(content, "application/json", facts, 0, 0, watch)
         with watch.time("infer"):
-            shade = shading.infer(gbuffer, plan, self.engine, cancelled)
+            shade = shading.infer(gbuffer, plan, engine, cancelled, consume=True)
         with watch.time("encode"):
-            facts = shading.describe(gbuffer, plan, self.engine)
-            content, media_type = shading.encode(shade, gbuffer, self.engine, self.asked, facts)
-        return Answer(content, media_type, facts, gbuffer.background.size, watch)
+            content, media_type = shading.encode(shade, gbuffer, asked, facts, made)
+        return Answer(content, media_type, facts, gbuffer.background.size, plan.computed, watch)
 
-    def _memory(self, headers: list[exr.Header]) -> tuple[int, int]:
-        """(bytes that the whole job needs, bytes that one prediction may use).
+    def _final(
+        self, scene: Scene, choice: Choice, engine: Engine, room: Room
+    ) -> tuple[Choice, Engine]:
+        """The choice again, now that it is known what has to be computed.
 
-        Raises LimitError when the job would exceed the memory even with the smallest tiles.
+        Among those whose inputs have been decoded. One whose tiles exceed the memory that is held
+        doesn't come into question; then the first choice stays, for which it was held.
         """
-        bundle, per_pixel = self.engine.bundle, self.engine.bytes_per_pixel
-        # any part may turn out to be the one that is shaded
-        height, width = max((p.shape for header in headers for p in header.parts), key=prod)
-        # Throughout: the files, their channels as float32 with masks, the answer and its copies.
-        pixel = 4 * self.engine.channels + 4 + 12 * len(bundle.outputs)
-        held = sum(header.body_bytes for header in headers) + pixel * width * height
-        # First all channels as they are stored, then what the inputs may be derived from, and
-        # after that, in the same room, the network.
-        sources = 4 * self.engine.channels * width * height
-        decoded = max(sources, sum(header.decoded_bytes for header in headers))
-        multiple, halo = bundle.size_multiple, bundle.halo
-        smallest = per_pixel * smallest_tile(height, width, multiple=multiple, halo=halo)
-        least = held + max(decoded, smallest)
-        if least > self.memory.total:
-            raise LimitError("memory_bytes", least, self.memory.total)
-        room = max(int(_SHARE * self.memory.total), least) - held
-        tile_bytes = min(room, per_pixel * prod(padded(height, width, multiple)))
-        return held + max(decoded, tile_bytes), tile_bytes
+        asked = self.choices.asked
+        plans: dict[str, Plan] = {}
+
+        def pixels(candidate: Candidate) -> int:
+            bundle = candidate.bundle
+            if bundle.name not in plans:
+                plans[bundle.name] = scene.plan(bundle, asked, room.max_pixels(engine))
+            return plans[bundle.name].computed
+
+        decoded = set(scene.gbuffer.attributes)
+        pool = tuple(c for c in self.choices.pool if decoded.issuperset(c.bundle.inputs))
+        final = replace(self.choices, pool=pool).final(pixels)
+        if final.candidate is choice.candidate:
+            return final, engine
+        other = self.load(final.candidate)
+        tiles = scene.plan(other.bundle, asked, room.max_pixels(other)).tiling
+        largest = max((prod(tile.shape) for tile in tiles), default=0)
+        if largest * bytes_per_pixel(other) > room.tile_bytes:
+            reason = f"{choice.reason} that fits the memory ({other.bundle.name} doesn't)"
+            return Choice(choice.candidate, reason), engine
+        return final, other

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
-import os
 import re
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from deepshade.errors import ConfigError
+from deepshade.machine import resident, trim
+
+__all__ = ["MemoryBudget", "parse_size", "resident", "trim"]
 
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 
@@ -22,21 +21,6 @@ def parse_size(text: str | int) -> int:
     if match is None:
         raise ConfigError("memory", detail=f"'{text}' is no size; write for example 512M or 2G")
     return int(float(match[1]) * _UNITS[match[2]])
-
-
-def resident() -> int:
-    """Bytes of this process in physical memory; 0 where the system doesn't say."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:  # not Linux
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-def trim() -> None:
-    """Return freed memory to the system. glibc otherwise keeps what lies below its heap's top."""
-    if _malloc_trim is not None:
-        _malloc_trim(0)
 
 
 class MemoryBudget:
@@ -67,15 +51,3 @@ class MemoryBudget:
             with self._changed:
                 self._free += amount
                 self._changed.notify_all()
-
-
-def _find_malloc_trim() -> ctypes._NamedFuncPointer | None:
-    if not sys.platform.startswith("linux"):
-        return None
-    try:
-        return ctypes.CDLL(None).malloc_trim
-    except (OSError, AttributeError):  # musl has no malloc_trim
-        return None
-
-
-_malloc_trim = _find_malloc_trim()

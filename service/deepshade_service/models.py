@@ -1,83 +1,270 @@
-"""The bundles that this service has loaded."""
+"""The bundles that this service has, on what each can run, and the engines in memory."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS, Effect
-from deepshade.errors import nearest
-from deepshade_service.engine import Engine
+from deepshade.engines import Backend, Engine, load_engine, usable
+from deepshade.errors import EngineError, nearest
+from deepshade_service.calibration import Calibration, Measurement, published
 from deepshade_service.problems import Problem
 
 log = logging.getLogger("deepshade.service")
 
+# What a backend may add to a bundle's error and still be chosen when nobody asked.
+MOST_ADDED = 0.02
+# Engines kept in memory beside each bundle's default: those that requests pinned.
+_PINNED = 4
+_TYPICAL = 768 * 512
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A bundle on a backend: what a request may get.
+
+    `dssim` is the error to expect on real views and `added` the share that the backend adds to
+    the bundle's own; None where nothing was measured. `default` marks what the bundle runs on
+    when a request says nothing of it, which is the fastest that adds at most `MOST_ADDED`.
+    """
+
+    bundle: Bundle
+    backend: Backend
+    dssim: float | None = None
+    added: float | None = None
+    fixed_ms: float | None = None
+    ms_per_megapixel: float | None = None
+    calibrated: bool = False
+    default: bool = False
+
+    def ms(self, pixels: int) -> float | None:
+        """Milliseconds of the network for so many computed pixels; None if never measured."""
+        if self.fixed_ms is None or self.ms_per_megapixel is None:
+            return None
+        return self.fixed_ms + self.ms_per_megapixel * pixels / 1e6
+
 
 class Models:
-    """Engines by effect and bundle name. `load` blocks; the rest is cheap."""
+    """Bundles by effect and name, and engines for them. `load` and `calibrate` block.
 
-    def __init__(self, root: Path, *, threads: int) -> None:
+    `calibration` is the file that keeps what was measured. Without one (None) every bundle runs
+    on the first of `available`, which is ONNX Runtime in fp32, unless a request pins another.
+    """
+
+    def __init__(self, root: Path, *, threads: int, calibration: Path | None = None) -> None:
         self.root = root
         self.ready = False
+        self.calibrating = False
         self.refused: list[str] = []
+        self.calibration = (
+            None if calibration is None else Calibration(calibration, threads=threads)
+        )
         self._threads = threads
-        self._engines: dict[str, dict[str, Engine]] = {}
+        self._bundles: dict[str, dict[str, Bundle]] = {}
+        self._engines: OrderedDict[tuple[Path, Backend], Engine] = OrderedDict()
+        self._loading: dict[tuple[Path, Backend], threading.Lock] = {}
+        self._lock = threading.Lock()
+        self._known: dict[Path, tuple[int, list[Candidate]]] = {}
 
     def load(self) -> None:
-        """Load and warm every bundle under the root; one that can't be used is left out, loudly."""
+        """Verify every bundle and warm its default; what can't be used is left out, loudly."""
+        self.calibrating = self.calibration is not None
         for folder in bundle_folders(self.root):
             self._load_one(folder)
-        self.ready = bool(self._engines)
+        self.ready = bool(self._bundles)
         if not self.ready:
+            self.calibrating = False
             log.error("no usable bundle under %s: the service stays unready", self.root)
 
     def _load_one(self, path: Path) -> None:
         label = f"{path.parent.name}/{path.name}"
         try:
             bundle = Bundle.load(path)
-            engine = Engine(bundle, threads=self._threads)
-            engine.warm()
+            engine = self.engine(self._default(bundle))
         except Exception as error:
-            # Also what ONNX Runtime raises: one bad bundle must not take the others down.
+            # Also what the libraries raise: one bad bundle must not take the others down.
             self.refused.append(label)
             log.error("bundle %s is refused: %s", label, error)
             return
-        self._engines.setdefault(bundle.effect, {})[bundle.name] = engine
+        self._bundles.setdefault(bundle.effect, {})[bundle.name] = bundle
         log.info(
-            "bundle %s (%s) is loaded, %d bytes a pixel",
+            "bundle %s (%s) is loaded on %s, %d bytes a pixel",
             label,
             bundle.short_hash,
+            engine.backend,
             engine.bytes_per_pixel,
         )
 
-    def __iter__(self) -> Iterator[Engine]:
-        return (engine for named in self._engines.values() for engine in named.values())
+    def calibrate(self, cancelled: threading.Event) -> None:
+        """Measure what this machine hasn't measured yet, and warm what turns out as default.
 
-    def bundles(self, effect: str) -> list[Engine]:
-        """The engines for one effect, its default first."""
-        return list(self._engines.get(effect, {}).values())
+        Ends soon after `cancelled` is set. Until a bundle is measured it runs in fp32.
+        """
+        try:
+            if self.calibration is None:
+                return
+            for bundle in [b for named in self._bundles.values() for b in named.values()]:
+                missing = self.calibration.missing(bundle)
+                if not missing or cancelled.is_set():
+                    continue
+                log.info("measuring %s/%s on this machine", bundle.effect, bundle.name)
+                self.calibration.measure(bundle, missing, cancelled)
+                chosen = self._default(bundle)
+                self.engine(chosen)
+                log.info("%s/%s runs on %s", bundle.effect, bundle.name, chosen.backend)
+        finally:
+            self.calibrating = False
+            self._drop()
+
+    def __iter__(self) -> Iterator[Engine]:
+        """The engines in memory."""
+        with self._lock:
+            return iter(list(self._engines.values()))
+
+    def bundles(self, effect: str) -> list[Bundle]:
+        """The bundles of one effect, the one with the least error first."""
+        return sorted(self._bundles.get(effect, {}).values(), key=_error)
+
+    def candidates(self, effect: str) -> list[Candidate]:
+        """Every bundle on every backend it can run on: by the bundle's error, its default first.
+
+        Raises Problem 404 (unknown effect, no bundle) and 503 (not ready).
+        """
+        self._check(effect)
+        return [one for bundle in self.bundles(effect) for one in self._of(bundle)]
+
+    def candidate(
+        self,
+        effect: str,
+        name: str | None = None,
+        engine: str | None = None,
+        precision: str | None = None,
+    ) -> Candidate:
+        """The best bundle or the one of that name, on its default or on what is pinned.
+
+        With one of `engine` and `precision` pinned it is the fastest of those left (the first
+        known, before any is measured). Raises Problem 404 (no such effect or bundle), 422 (no
+        such backend here) and 503 (not ready).
+        """
+        bundle = self._find(effect, name)
+        all_ = self._of(bundle)
+        fitting = [
+            one
+            for one in all_
+            if engine in (None, one.backend.engine) and precision in (None, one.backend.precision)
+        ]
+        if not fitting:
+            asked = "/".join(part or "*" for part in (engine, precision))
+            raise Problem(
+                422,
+                "no-backend",
+                f"the bundle '{bundle.name}' can't run on {asked[:100]} here",
+                fix="choose one of `available`, or leave out ?engine= and ?precision=",
+                available=[str(one.backend) for one in all_],
+            )
+        defaults = [one for one in fitting if one.default]
+        return defaults[0] if defaults else min(fitting, key=_speed)
 
     def pick(self, effect: str, name: str | None = None) -> Engine:
-        """The engine for an effect: the bundle of that name, or the first by name.
+        """The engine of a bundle's default, warm. Raises what `candidate` raises."""
+        return self.engine(self.candidate(effect, name))
 
-        Raises Problem 404 (unknown effect, no such bundle) and 503 (not ready).
+    def engine(self, candidate: Candidate) -> Engine:
+        """The candidate's engine, warm; blocks while it is loaded.
+
+        Raises EngineError, which `usable` backends only do when a library refuses the graph.
         """
+        key = candidate.bundle.path, candidate.backend
+        with self._lock:
+            if key in self._engines:
+                self._engines.move_to_end(key)
+                return self._engines[key]
+            loading = self._loading.setdefault(key, threading.Lock())
+        with loading:
+            with self._lock:
+                if key in self._engines:
+                    return self._engines[key]
+            engine = load_engine(candidate.bundle, candidate.backend, threads=self._threads)
+            engine.warm()
+            with self._lock:
+                self._engines[key] = engine
+        self._drop()
+        return engine
+
+    def _drop(self) -> None:
+        """Forget the engines that were pinned longest ago; defaults stay."""
+        bundles = [b for named in self._bundles.values() for b in named.values()]
+        kept = {(bundle.path, self._default(bundle).backend) for bundle in bundles}
+        with self._lock:
+            others = [key for key in self._engines if key not in kept]
+            for key in others[: max(0, len(others) - _PINNED)]:
+                del self._engines[key]
+
+    def _of(self, bundle: Bundle) -> list[Candidate]:
+        """A bundle's candidates, its default first."""
+        revision = -1 if self.calibration is None else self.calibration.revision
+        made, candidates = self._known.get(bundle.path, (None, []))
+        if made != revision:
+            candidates = self._list(bundle)
+            self._known[bundle.path] = revision, candidates
+        return candidates
+
+    def _list(self, bundle: Bundle) -> list[Candidate]:
+        own = published(bundle)
+        known: dict[Backend, Measurement] = {}
+        backends = usable(bundle)
+        if self.calibration is not None:
+            known = {found.backend: found for found in self.calibration.all(bundle)}
+            backends = [b for b in backends if not self.calibration.failed(bundle, b)]
+        # What isn't measured yet could be anything: 32 bits until all of it is.
+        whole = bool(backends) and all(backend in known for backend in backends)
+        chosen = (fastest(known.values()) if whole else None) or next(iter(backends), None)
+        candidates = []
+        for backend in backends:
+            found = known.get(backend)
+            default = backend == chosen
+            if found is None:
+                dssim = own if backend.precision == "fp32" else None
+                candidates.append(Candidate(bundle, backend, dssim, default=default))
+                continue
+            dssim = found.dssim if found.dssim is not None else own
+            measured = (found.added, found.fixed_ms, found.ms_per_megapixel)
+            candidates.append(Candidate(bundle, backend, dssim, *measured, True, default))
+        return sorted(candidates, key=lambda one: not one.default)
+
+    def _default(self, bundle: Bundle) -> Candidate:
+        candidates = self._of(bundle)
+        if not candidates:
+            raise EngineError(
+                "no engine is installed", fix="pip install 'deepshade[service]', then restart"
+            )
+        return candidates[0]
+
+    def _check(self, effect: str) -> dict[str, Bundle]:
         find_effect(effect)
         if not self.ready:
             raise not_ready(self)
-        named = self._engines.get(effect, {})
+        named = self._bundles.get(effect, {})
         if not named:
             raise Problem(
                 404,
                 "no-bundle",
                 f"no bundle for the effect '{effect}' is installed here",
                 fix=f"put one into the service's models folder as {effect}/<name>/, and restart",
-                installed=sorted(self._engines),
+                installed=sorted(self._bundles),
             )
+        return named
+
+    def _find(self, effect: str, name: str | None) -> Bundle:
+        named = self._check(effect)
         if name is None:
-            return next(iter(named.values()))
+            return self.bundles(effect)[0]
         if name not in named:
             close = nearest(name, named)
             raise Problem(
@@ -88,6 +275,32 @@ class Models:
                 installed=sorted(named),
             )
         return named[name]
+
+
+def fastest(known: Iterable[Measurement]) -> Backend | None:
+    """The fastest of the measured backends that adds at most `MOST_ADDED`; None if none does.
+
+    16 and 8 bits only count where their error is known; 32 bits are taken for exact.
+    """
+    good = [
+        found
+        for found in known
+        if (0.0 if found.added is None and found.backend.precision == "fp32" else found.added)
+        is not None
+        and (found.added or 0.0) <= MOST_ADDED
+    ]
+    return min(good, key=lambda found: found.ms(_TYPICAL)).backend if good else None
+
+
+def _error(bundle: Bundle) -> tuple[float, str]:
+    """Known errors first; then by name."""
+    error = published(bundle)
+    return (float("inf") if error is None else error), bundle.name
+
+
+def _speed(candidate: Candidate) -> float:
+    ms = candidate.ms(_TYPICAL)
+    return float("inf") if ms is None else ms
 
 
 def find_effect(name: str) -> Effect:

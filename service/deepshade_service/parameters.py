@@ -52,8 +52,44 @@ class ShadeParameters(BaseModel):
         Field(description="`attribute=channel or layer`, repeatable: where an attribute is."),
     ] = []
     bundle: Annotated[
-        str | None, Field(description="Which of the effect's bundles; else its first.")
+        str | None,
+        Field(description="Which of the effect's bundles; else `balanced`, else the most exact."),
     ] = None
+    quality: Annotated[
+        Literal["fast", "balanced", "best"] | None,
+        Field(description="The bundle of that name."),
+    ] = None
+    max_error: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            le=1,
+            allow_inf_nan=False,
+            description="The largest error (DSSIM, as measured on held-out views): the fastest"
+            " bundle and precision within it.",
+        ),
+    ] = None
+    budget_ms: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            allow_inf_nan=False,
+            description="Milliseconds that the network may take, by this machine's calibration:"
+            " the most accurate bundle and precision within it.",
+        ),
+    ] = None
+    engine: Annotated[
+        str | None,
+        Field(description="What the network must run on, as `onnxruntime` or `openvino`."),
+    ] = None
+    precision: Annotated[
+        Literal["fp32", "bf16", "fp16", "int8"] | None,
+        Field(description="How exactly it must calculate."),
+    ] = None
+    explain: Annotated[
+        bool,
+        Field(description="The plan as JSON instead of the picture; nothing is computed."),
+    ] = False
     format: Annotated[
         Literal["exr", "png"],
         Field(

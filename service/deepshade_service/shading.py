@@ -1,11 +1,11 @@
-"""Shading one picture in four named steps: decode, plan, infer, encode."""
+"""Shading one picture: decode, infer, encode (`planner` has the step between the first two)."""
 
 from __future__ import annotations
 
 import io
+import json
 import threading
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from deepshade import exr, pictures
 from deepshade.attributes import ATTRIBUTES
+from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
+from deepshade.engines import Engine
 from deepshade.gbuffer import GBuffer, load_gbuffer
-from deepshade_service.engine import Engine
-from deepshade_service.parameters import MAX_RADIUS, MIN_RADIUS, ShadeParameters
+from deepshade_service.parameters import ShadeParameters
+from deepshade_service.planner import Json, Plan, known_pixels
 from deepshade_service.pool import Cancelled
 from deepshade_service.problems import Problem
-from deepshade_service.tiles import Tile, Tiling, plan_tiles
+from deepshade_service.tiles import Tile
 from deepshade_service.uploads import Upload
 
 Float = NDArray[np.float32]
@@ -29,31 +31,21 @@ Facts = dict[str, str | float | int]
 _MOST_RADII = 1e6
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What will be computed: with which radius (scene units), and in which tiles."""
-
-    radius: float
-    radius_source: str
-    tiling: Tiling
-
-
 def decode(
     files: Sequence[Upload],
     headers: Sequence[exr.Header],
-    engine: Engine,
+    bundle: Bundle,
     asked: ShadeParameters,
     limits: exr.Limits,
 ) -> GBuffer:
-    """The G-buffer that the engine's network needs, found or derived in the files.
+    """The G-buffer that the bundle's network needs, found or derived in the files.
 
-    `headers` are the files' own, read before.
-
-    Raises what `load_gbuffer` raises.
+    Nothing else is decoded. `headers` are the files' own, read before. Raises what
+    `load_gbuffer` raises.
     """
     return load_gbuffer(
         [(file.name, file.data) for file in files],
-        engine.bundle.inputs,
+        bundle.inputs,
         profile=asked.profile,
         mapping=asked.mapping,
         fov=asked.fov,
@@ -62,38 +54,32 @@ def decode(
     )
 
 
-def plan(gbuffer: GBuffer, engine: Engine, asked: ShadeParameters, tile_bytes: int) -> Plan:
-    """Choose the radius (asked, else the header's, else the bundle's) and the tiles.
-
-    `tile_bytes` is what one prediction may use. Raises Problem 422 for an impossible radius in
-    the header.
-    """
-    bundle = engine.bundle
-    if asked.radius is not None:
-        radius, source = asked.radius, "request"
-    elif (stored := gbuffer.header.get("deepshade:radius")) is not None:
-        radius, source = _header_radius(stored), "header"
-    else:
-        radius, source = bundle.radius, "bundle"
-    height, width = gbuffer.background.shape
-    tiling = plan_tiles(
-        height,
-        width,
-        multiple=bundle.size_multiple,
-        halo=bundle.halo,
-        max_pixels=tile_bytes // engine.bytes_per_pixel,
-    )
-    return Plan(radius, source, tiling)
-
-
-def infer(gbuffer: GBuffer, plan: Plan, engine: Engine, cancelled: threading.Event) -> Float:
+def infer(
+    gbuffer: GBuffer,
+    plan: Plan,
+    engine: Engine,
+    cancelled: threading.Event,
+    *,
+    consume: bool = False,
+) -> Float:
     """Run the network tile by tile: (C', H, W), the effect's background where there is none.
 
-    Raises Cancelled between tiles when the event is set.
+    What no tile answers is background, or known. `consume` allows to scale the G-buffer's own
+    positions in place, which spares time and memory; it is of no use afterwards. Raises
+    Cancelled between tiles when the event is set.
     """
     effect = EFFECTS[engine.bundle.effect]
-    shade = np.empty((len(effect.outputs), *gbuffer.background.shape), np.float32)
-    for planes, out in passes(gbuffer, engine, plan.radius, shade):
+    divisors = _divisors(engine.bundle, plan.radius)
+    if consume:
+        for name, divisor in divisors.items():
+            for plane in gbuffer.attributes[name]:
+                _scale(plane, divisor, plane)
+        divisors = {}
+    answered = sum(_valid_area(tile) for tile in plan.tiling)
+    shade = np.empty((len(effect.outputs), *gbuffer.shape), np.float32)
+    if answered < gbuffer.background.size:
+        shade.fill(effect.background)
+    for planes, out in passes(gbuffer, engine.bundle, divisors, shade):
         for tile in plan.tiling:
             if cancelled.is_set():
                 raise Cancelled
@@ -106,7 +92,10 @@ def infer(gbuffer: GBuffer, plan: Plan, engine: Engine, cancelled: threading.Eve
             ]
     if gbuffer.background.any():
         np.copyto(shade, np.float32(effect.background), where=gbuffer.background)
-    if not np.isfinite(shade).all():
+    if plan.known is not None:
+        np.copyto(shade, plan.known.value, where=plan.known.pixels)
+    # One sum, unless something is wrong: a single number that isn't finite makes it so too.
+    if not np.isfinite(shade.sum()) and not np.isfinite(shade).all():
         raise Problem(
             500,
             "bad-answer",
@@ -117,18 +106,20 @@ def infer(gbuffer: GBuffer, plan: Plan, engine: Engine, cancelled: threading.Eve
 
 
 def encode(
-    shade: Float, gbuffer: GBuffer, engine: Engine, asked: ShadeParameters, facts: Facts
+    shade: Float, gbuffer: GBuffer, asked: ShadeParameters, facts: Facts, plan: Json
 ) -> tuple[bytes, str]:
-    """The answer's bytes and media type; it has the G-buffer's windows, and `facts` in its header.
+    """The answer's bytes and media type; it has the G-buffer's windows.
 
-    The frame starts at (0, 0), whatever the display window's corner was.
+    Its header holds `facts` and, as JSON, the `plan`. The frame starts at (0, 0), whatever the
+    display window's corner was.
     """
     if asked.format == "png":
-        picture = pictures.of_effect(shade, EFFECTS[engine.bundle.effect])
+        picture = pictures.of_effect(shade, EFFECTS[str(facts["effect"])])
         return pictures.png(picture), "image/png"
     outputs = "Y" if len(shade) == 1 else "RGB"
     attributes: dict[str, Any] = gbuffer.camera.to_header() if gbuffer.camera else {}
     attributes |= {f"deepshade:{name}": value for name, value in facts.items()}
+    attributes["deepshade:plan"] = json.dumps(plan, separators=(",", ":"))
     (x0, y0, *_), (left, top, right, bottom) = gbuffer.data_window, gbuffer.display_window
     stream = io.BytesIO()
     exr.write(
@@ -143,68 +134,78 @@ def encode(
     return stream.getvalue(), "image/x-exr"
 
 
-def describe(gbuffer: GBuffer, plan: Plan, engine: Engine) -> Facts:
-    """How an answer was made, for its EXR header and the response's headers."""
+def describe(gbuffer: GBuffer, plan: Plan, engine: Engine, made: Json) -> Facts:
+    """How an answer was made, for its EXR header and the response's headers.
+
+    `made` is the plan as JSON; facts that aren't known are left out.
+    """
     bundle = engine.bundle
-    return {
+    facts: Facts = {
         "effect": bundle.effect,
         "bundle": bundle.name,
         "bundle_sha256": bundle.sha256,
-        "engine": engine.name,
-        "precision": engine.precision,
+        "engine": engine.backend.engine,
+        "precision": engine.backend.precision,
         "radius": plan.radius,
         "radius_source": plan.radius_source,
         "mapped": _listed(gbuffer.mapped),
         "derived": _listed(gbuffer.derived),
-        "background_pixels": int(np.count_nonzero(gbuffer.background)),
+        "background_pixels": made["pixels"]["background"],
         "nonfinite_pixels": int(gbuffer.nonfinite),
+        "known_pixels": known_pixels(plan),
+        "computed_pixels": plan.computed,
         "tiles": len(plan.tiling),
+    }
+    return facts | {
+        name: made[name] for name in ("dssim", "added", "predicted_ms") if made[name] is not None
     }
 
 
-def _header_radius(stored: Any) -> float:
-    try:
-        radius = float(stored)
-    except (TypeError, ValueError):
-        radius = float("nan")
-    if not MIN_RADIUS <= radius <= MAX_RADIUS:
-        raise Problem(
-            422,
-            "bad-header",
-            f"the image's header says deepshade:radius = {str(stored)[:60]}",
-            fix="it must be a positive number; ?radius= overrides it",
-        )
-    return radius
+def first_input(gbuffer: GBuffer, plan: Plan, bundle: Bundle) -> Float:
+    """What the network is given first for this plan, (1, C, h, w): for timing it alone."""
+    shade = np.empty((len(EFFECTS[bundle.effect].outputs), 1, 1), np.float32)
+    planes, _ = next(passes(gbuffer, bundle, _divisors(bundle, plan.radius), shade))
+    return cut(planes, next(iter(plan.tiling)))
 
 
-Plane = tuple[Float, float]  # (H, W) and what to divide it by
+def _divisors(bundle: Bundle, radius: float) -> dict[str, float]:
+    """What attributes have to be divided by for the network: positions, by the radius."""
+    if bundle.position_scale != "1/radius":
+        return {}
+    return {name: radius for name in bundle.inputs if ATTRIBUTES[name].kind == "point"}
+
+
+Plane = tuple[Float, float | None]  # (H, W) and what to divide it by, None if by nothing
 
 
 def passes(
-    gbuffer: GBuffer, engine: Engine, radius: float, shade: Float
+    gbuffer: GBuffer, bundle: Bundle, divisors: Mapping[str, float], shade: Float
 ) -> Iterator[tuple[list[Plane], Float]]:
     """Each network run's input planes, in network order, and the part of `shade` it fills.
 
     A per-channel effect is one run for each colour channel, with that channel of its colours.
     """
-    effect = EFFECTS[engine.bundle.effect]
-    scaled = engine.bundle.position_scale == "1/radius"
+    effect = EFFECTS[bundle.effect]
     runs: list[int | None] = list(range(len(effect.outputs))) if effect.per_channel else [None]
     for run in runs:
         planes: list[Plane] = []
-        for name in engine.bundle.inputs:
-            kind = ATTRIBUTES[name].kind
+        for name in bundle.inputs:
             pixels = gbuffer.attributes[name]
-            chosen = pixels if run is None or kind != "colour" else pixels[run : run + 1]
-            divisor = radius if kind == "point" and scaled else 1.0
-            planes += [(plane, divisor) for plane in chosen]
+            one = run is not None and ATTRIBUTES[name].kind == "colour"
+            chosen = pixels[run : run + 1] if run is not None and one else pixels
+            planes += [(plane, divisors.get(name)) for plane in chosen]
         yield planes, shade if run is None else shade[run : run + 1]
 
 
 def cut(planes: list[Plane], tile: Tile) -> Float:
-    """(1, C, h, w): the tile of every plane, scaled; zero, which is background, past the edge."""
+    """(1, C, h, w): the tile of every plane, scaled; zero, which is background, past the edge.
+
+    No copy where the planes are what is wanted already.
+    """
     height, width = planes[0][0].shape
     rows, columns = tile.rows, tile.columns
+    if tile.shape == (height, width) and (block := _block(planes)) is not None:
+        return block[None]
     bottom, right = min(rows.stop, height), min(columns.stop, width)
     inside = (slice(0, bottom - rows.start), slice(0, right - columns.start))
     gbuffer = np.empty((1, len(planes), *tile.shape), np.float32)
@@ -212,13 +213,42 @@ def cut(planes: list[Plane], tile: Tile) -> Float:
     gbuffer[:, :, :, inside[1].stop :] = 0
     for (plane, divisor), target in zip(planes, gbuffer[0], strict=True):
         source = plane[rows.start : bottom, columns.start : right]
-        if divisor == 1.0:
+        if divisor is None:
             target[inside] = source
-            continue
-        with np.errstate(over="ignore"):
-            np.divide(source, np.float32(divisor), out=target[inside])
-        np.clip(target, -_MOST_RADII, _MOST_RADII, out=target)
+        else:
+            _scale(source, divisor, target[inside])
     return gbuffer
+
+
+def _scale(source: Float, divisor: float, out: Float) -> None:
+    """Positions in radii, so bounded that they stay finite."""
+    with np.errstate(over="ignore"):
+        np.divide(source, np.float32(divisor), out=out)
+    np.clip(out, -_MOST_RADII, _MOST_RADII, out=out)
+
+
+def _block(planes: list[Plane]) -> Float | None:
+    """(C, H, W) if the planes lie one after the other in one array, unscaled; else None."""
+    arrays = [plane for plane, _ in planes]
+    owner = arrays[0].base
+    if any(divisor is not None for _, divisor in planes) or not (
+        isinstance(owner, np.ndarray)
+        and owner.dtype == np.float32
+        and owner.flags.c_contiguous
+        and all(plane.base is owner and plane.flags.c_contiguous for plane in arrays)
+    ):
+        return None
+    size = arrays[0].nbytes
+    starts = [plane.ctypes.data - owner.ctypes.data for plane in arrays]
+    first = starts[0] // size
+    if starts != [(first + k) * size for k in range(len(arrays))]:
+        return None
+    return owner.reshape(-1, *arrays[0].shape)[first : first + len(arrays)]
+
+
+def _valid_area(tile: Tile) -> int:
+    rows, columns = tile.rows, tile.columns
+    return (rows.last - rows.first) * (columns.last - columns.first)
 
 
 def _listed(entries: dict[str, str]) -> str:

@@ -56,6 +56,12 @@ class Telemetry:
         self._pixels = Counter(
             "deepshade_pixels", "Pixels shaded", ["effect"], registry=self._registry
         )
+        self._computed = Counter(
+            "deepshade_computed_pixels",
+            "Pixels that networks computed, overlaps and padding included",
+            ["effect"],
+            registry=self._registry,
+        )
         self._nonfinite = Counter(
             "deepshade_nonfinite_pixels",
             "Pixels with a NaN or an infinity, treated as background",
@@ -73,11 +79,14 @@ class Telemetry:
         """Count a response."""
         self._requests.labels(route, str(status)).inc()
 
-    def shaded(self, effect: str, watch: Stopwatch, pixels: int, nonfinite: int) -> None:
+    def shaded(
+        self, effect: str, watch: Stopwatch, pixels: int, computed: int, nonfinite: int
+    ) -> None:
         """Count a shaded picture."""
         for stage, ms in watch.milliseconds.items():
             self._stages.labels(effect, stage).observe(ms / 1e3)
         self._pixels.labels(effect).inc(pixels)
+        self._computed.labels(effect).inc(computed)
         self._nonfinite.labels(effect).inc(nonfinite)
 
     def render(self) -> bytes:

@@ -57,11 +57,11 @@ def plan_tiles(height: int, width: int, *, multiple: int, halo: int, max_pixels:
     `multiple` is the network's size multiple and `halo` its reach, both in pixels. Tiles of
     `smallest_tile` are used even if they exceed `max_pixels`.
     """
-    halo = _up(halo, multiple)
+    halo = up(halo, multiple)
     best: tuple[int, int, int] | None = None  # pixels computed, rows, columns
     for across in range(1, math.ceil(width / multiple) + 1):
         widest, columns = _sizes(width, across, multiple, halo)
-        if best is not None and columns * _up(height, multiple) >= best[0]:
+        if best is not None and columns * up(height, multiple) >= best[0]:
             break  # more columns only add overlap
         down = _fewest_cuts(height, multiple, halo, max_pixels // widest)
         if down is not None:
@@ -80,20 +80,20 @@ def smallest_tile(height: int, width: int, *, multiple: int, halo: int) -> int:
     Three quarters of it are overlap. With still smaller tiles the work explodes: with a halo of
     256 and tiles that are valid in 64 x 64, each pixel would be computed 81 times.
     """
-    halo = _up(halo, multiple)
+    halo = up(halo, multiple)
     side = _least(multiple, halo) + 2 * halo
-    return min(_up(height, multiple), side) * min(_up(width, multiple), side)
+    return min(up(height, multiple), side) * min(up(width, multiple), side)
 
 
 def padded(height: int, width: int, multiple: int) -> tuple[int, int]:
     """The size rounded up to the network's multiple."""
-    return _up(height, multiple), _up(width, multiple)
+    return up(height, multiple), up(width, multiple)
 
 
 def _cut(length: int, count: int, multiple: int, halo: int) -> tuple[Span, ...]:
     """About `count` equal spans of whole cells that cover `length` pixels."""
-    end = _up(length, multiple)
-    step = _up(math.ceil(end / count), multiple)
+    end = up(length, multiple)
+    step = up(math.ceil(end / count), multiple)
     return tuple(
         Span(max(0, at - halo), min(end, at + step + halo), at, min(length, at + step))
         for at in range(0, end, step)
@@ -102,18 +102,18 @@ def _cut(length: int, count: int, multiple: int, halo: int) -> tuple[Span, ...]:
 
 def _sizes(length: int, count: int, multiple: int, halo: int) -> tuple[int, int]:
     """(pixels of the largest span, sum of all) of `_cut`, or more if the halos exceed the spans."""
-    end = _up(length, multiple)
-    step = _up(math.ceil(end / count), multiple)
+    end = up(length, multiple)
+    step = up(math.ceil(end / count), multiple)
     count = math.ceil(end / step)
     return min(end, step + min(2, count - 1) * halo), end + 2 * halo * (count - 1)
 
 
 def _fewest_cuts(length: int, multiple: int, halo: int, longest: int) -> int | None:
     """The fewest cuts after which no span is computed over more than `longest` pixels."""
-    if _up(length, multiple) <= longest:
+    if up(length, multiple) <= longest:
         return 1
     # Two spans share one inner edge, so each needs only one halo.
-    if _up(math.ceil(_up(length, multiple) / 2), multiple) + halo <= longest:
+    if up(math.ceil(up(length, multiple) / 2), multiple) + halo <= longest:
         return 2
     room = (longest - 2 * halo) // multiple * multiple
     return math.ceil(length / room) if room > 0 else None
@@ -124,5 +124,6 @@ def _least(multiple: int, halo: int) -> int:
     return max(multiple, 2 * halo)
 
 
-def _up(value: int, multiple: int) -> int:
-    return math.ceil(value / multiple) * multiple
+def up(value: int, multiple: int) -> int:
+    """`value` rounded up to a multiple."""
+    return -(-value // multiple) * multiple

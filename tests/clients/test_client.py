@@ -97,6 +97,30 @@ def test_shade(server, make_exr, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out.exr", "view.exr"]
 
 
+def test_explain_is_the_plan_of_the_answer(server, make_exr):
+    options = Options(radius=0.25, bundle="tiny", engine="onnxruntime", precision="fp32")
+    with Client(server) as client:
+        plan = client.explain("ao", make_exr(24, 32), options)
+        answer = client.shade("ao", make_exr(24, 32), options)
+        png = client.shade("ao", make_exr(24, 32), Options(format="png"))
+    assert plan["asked"] == {"bundle": "tiny", "engine": "onnxruntime", "precision": "fp32"}
+    assert plan["radius"] == 0.25
+    assert answer.plan() == plan
+    assert png.plan() == {}
+
+    async def work():
+        async with AsyncClient(server) as client:
+            return await client.explain("ao", make_exr(24, 32), options)
+
+    assert asyncio.run(work()) == plan
+
+
+def test_what_cannot_be_met_says_by_how_much(server, make_exr):
+    with Client(server) as client, pytest.raises(BadRequest) as caught:
+        client.shade("ao", make_exr(8, 8), Options(quality="best"))
+    assert caught.value.kind == "no-bundle"
+
+
 def test_every_option_reaches_the_service(server, make_exr, make_picture):
     channels = {
         name.replace("normal", "thing"): plane for name, plane in make_picture(8, 8).items()
@@ -107,6 +131,9 @@ def test_every_option_reaches_the_service(server, make_exr, make_picture):
         profile="deepshade",
         mapping={"normal": "thing"},
         bundle="tiny",
+        max_error=0.5,
+        engine="onnxruntime",
+        precision="fp32",
         compression="piz",
         half=True,
     )
@@ -190,6 +217,11 @@ def test_mock_transport(make_exr):
     assert (answer.channels()["Y"] > 0.1).all()
     np.testing.assert_array_equal(several.channels()["Y"], answer.channels()["Y"])
     assert mock.requests[0].url.path == "/shade/ao"
+    with Client(transport=mock) as client:
+        plan = client.explain("ao", make_exr(4, 6), Options(quality="fast", budget_ms=3))
+    assert (plan["bundle"], plan["pixels"]["all"]) == ("mock", 24)
+    query = mock.requests[-1].url.params
+    assert (query["quality"], query["budget_ms"], query["explain"]) == ("fast", "3.0", "true")
 
     async def work():
         async with AsyncClient(transport=mock) as client:

@@ -135,6 +135,33 @@ def test_shade_a_folder_as_json(run, views, tmp_path):
         assert part.channels == {"Y": "float"}
 
 
+def test_explain_prints_the_plan_and_saves_nothing(run, views):
+    before = sorted(views.rglob("*"))
+    out, _ = run("shade", "ao", views, "--explain", "--engine", "onnxruntime", "--radius", "0.2")
+    pictures = json.loads(out)["pictures"]
+    assert [len(entry["input"]) for entry in pictures] == [1, 1, 1]
+    for entry, width in zip(pictures, (4, 5, 6), strict=True):
+        plan = entry["plan"]
+        assert plan["bundle"] == "tiny"
+        assert plan["asked"] == {"engine": "onnxruntime"}
+        assert plan["radius"] == 0.2
+        assert plan["pixels"]["width"] == width
+    assert sorted(views.rglob("*")) == before
+
+
+def test_what_chooses_the_bundle_reaches_the_service(run, views, tmp_path):
+    arguments = ["shade", "ao", views / "a.exr", "-o", tmp_path / "x.exr"]
+    run(*arguments, "--precision", "fp32", "--max-error", "0.5")
+    plan = json.loads(exr.read_header(tmp_path / "x.exr").parts[0].attributes["deepshade:plan"])
+    assert plan["asked"] == {"precision": "fp32", "max_error": 0.5}
+    _, err = run(*arguments, "--quality", "best", code=1)
+    assert "no bundle 'best'" in err
+    _, err = run(*arguments, "--budget-ms", "5", code=1)
+    assert "calibrat" in err
+    _, err = run("shade", "ao", views / "a.exr", code=2)
+    assert "--out" in err
+
+
 @pytest.mark.parametrize(("option", "name"), [(["--png"], "x"), ([], "x.png")])
 def test_png(run, views, tmp_path, option, name):
     run("shade", "ao", views / "a.exr", "-o", tmp_path / name, *option)
@@ -205,7 +232,9 @@ def test_several_are_in_flight(start, views, tmp_path, monkeypatch):
 
     async def work():
         async with AsyncClient(str(local.client.base_url)) as client:
-            return await batch.run(client, "ao", tasks, Options(), jobs=3, done=lambda result: None)
+            # so large a radius that pixels lie within it: else nothing has to be computed
+            options = Options(radius=50)
+            return await batch.run(client, "ao", tasks, options, jobs=3, done=lambda result: None)
 
     assert all(result.error is None for result in asyncio.run(work()))
 
@@ -223,7 +252,7 @@ def test_ctrl_c_leaves_no_half_files(start, views, tmp_path):
     out = tmp_path / "out"
     code = "import sys; from deepshade_client.cli import main; sys.exit(main())"
     process = subprocess.Popen(
-        [sys.executable, "-c", code, "shade", "ao", str(views), "-o", str(out)],
+        [sys.executable, "-c", code, "shade", "ao", str(views), "-o", str(out), "--radius", "50"],
         env=os.environ | {"DEEPSHADE_SERVER": str(local.client.base_url), "NO_PROXY": "*"},
         stderr=subprocess.PIPE,
         text=True,

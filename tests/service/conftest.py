@@ -128,7 +128,7 @@ def write_bundle(folder: Path, model: onnx.ModelProto, *, levels: int, **config:
         "fov": 50.0,
         "size_multiple": 2 ** (levels - 1),
         "halo": 6 * 2**levels,
-        "metrics": {"dssim": 0.25},
+        "metrics": {"error": {"test-real": {"exact": {"dssim": 0.25}}}},
     }
     write_config(folder, **(settings | config))
 
@@ -139,6 +139,16 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("models")
     write_bundle(root / "ao" / "tiny", unet(4, LEVELS), levels=LEVELS)
     return root
+
+
+@pytest.fixture
+def make_bundle() -> Callable[..., None]:
+    """`make_bundle(folder, **config)`: the small network as a bundle of one's own."""
+
+    def make(folder: Path, **config: Any) -> None:
+        write_bundle(folder, unet(4, LEVELS), levels=LEVELS, **config)
+
+    return make
 
 
 def picture(height: int, width: int, seed: int = 0) -> dict[str, np.ndarray]:
@@ -265,7 +275,7 @@ def start_server(models: Path) -> Iterator[Callable[..., Server]]:
 
     def start(*options: str, wait: bool = True, folder: Path | None = None) -> Server:
         command = "import sys; from deepshade.cli import main; sys.exit(main())"
-        arguments = ["--models", str(folder or models)]
+        arguments = ["--models", str(folder or models), "--calibration", "off"]
         process = subprocess.Popen(
             [sys.executable, "-c", command, "serve", "--port", "0", *arguments, *options],
             stdout=subprocess.PIPE,

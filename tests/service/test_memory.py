@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from deepshade import exr
 from deepshade.errors import ConfigError
 from deepshade_service.memory import MemoryBudget, parse_size, resident, trim
+from deepshade_service.room import room_for
 
 
 @pytest.mark.parametrize(
@@ -88,18 +91,27 @@ def test_an_idle_service_gives_its_memory_back(start, make_exr):
 
 def test_the_part_with_the_most_pixels_counts(service, make_exr):
     """Not the widest one: either may turn out to be the one that is shaded."""
-    from deepshade import exr
-    from deepshade_service.job import Job
-    from deepshade_service.memory import MemoryBudget
-    from deepshade_service.parameters import ShadeParameters
-
     engine = service.service.models.pick("ao")
-    job = Job(engine, [], ShadeParameters(), exr.Limits(), MemoryBudget(2**30))
     wide, large = (exr.read_header(make_exr(*size)) for size in ((1, 101), (100, 100)))
-    needed, _ = job._memory([large])
-    together, tile = job._memory([wide, large])
-    assert together > needed
-    assert tile >= engine.bytes_per_pixel * 100 * 100
+    alone = room_for([large], engine, 2**30)
+    together = room_for([wide, large], engine, 2**30)
+    assert together.needed > alone.needed
+    assert together.tile_bytes >= engine.bytes_per_pixel * 100 * 100
+    assert together.max_pixels(engine) >= 100 * 100
+
+
+def test_4k_stays_within_a_gibibyte_however_much_there_is(service, make_exr):
+    from types import SimpleNamespace
+
+    part = exr.read_header(make_exr(2, 2, half=True)).parts[0]
+    part = replace(part, data_window=(0, 0, 3839, 2159), decoded_bytes=2160 * 3840 * 12)
+    header = exr.Header((part,), body_bytes=60 * 2**20)
+    bundle = service.service.models.pick("ao").bundle
+    engine = SimpleNamespace(bundle=bundle, channels=6, bytes_per_pixel=150)
+    for total in (2**30, 2**33):
+        room = room_for([header], engine, total)
+        assert room.needed <= 2**30
+        assert room.max_pixels(engine) > 2**20
 
 
 def test_uploads_fit_the_machine(monkeypatch):
@@ -120,13 +132,7 @@ def test_what_a_derivation_takes_is_counted(service, make_exr, make_picture, mon
     """World-space attributes as half floats: read, converted, and beside them what they give."""
     import tracemalloc
 
-    import numpy as np
-
-    from deepshade import exr
     from deepshade.gbuffer import load_gbuffer
-    from deepshade_service.job import Job
-    from deepshade_service.memory import MemoryBudget
-    from deepshade_service.parameters import ShadeParameters
 
     channels = {
         name.replace(".", "_world."): plane for name, plane in make_picture(512, 512).items()
@@ -137,8 +143,7 @@ def test_what_a_derivation_takes_is_counted(service, make_exr, make_picture, mon
     header = exr.read_header(body)
     engine = service.service.models.pick("ao")
     monkeypatch.setattr(engine, "bytes_per_pixel", 1)  # as if the network took nothing
-    job = Job(engine, [], ShadeParameters(), exr.Limits(), MemoryBudget(2**30))
-    needed, _ = job._memory([header])
+    needed = room_for([header], engine, 2**30).needed
     tracemalloc.start()
     load_gbuffer(body, ("normal", "position"), headers=[header])
     _, peak = tracemalloc.get_traced_memory()

@@ -25,8 +25,12 @@ def test_effects(client):
     assert [entry["attribute"] for entry in ao["inputs"]] == ["normal", "position"]
     (bundle,) = ao["bundles"]
     assert bundle["name"] == "tiny"
-    assert bundle["metrics"] == {"dssim": 0.25}
+    assert bundle["metrics"] == {"error": {"test-real": {"exact": {"dssim": 0.25}}}}
+    assert bundle["dssim"] == 0.25
     assert bundle["radius"] == 0.5
+    assert bundle["halo"] == bundle["background_halo"]
+    assert (bundle["engine"], bundle["precision"]) == ("onnxruntime", "fp32")
+    assert sum(backend["default"] for backend in bundle["backends"]) == 1
 
 
 def test_schema_and_pages(client):
@@ -40,6 +44,12 @@ def test_schema_and_pages(client):
         "profile",
         "map",
         "bundle",
+        "quality",
+        "max_error",
+        "budget_ms",
+        "engine",
+        "precision",
+        "explain",
         "format",
         "compression",
         "half",
@@ -58,6 +68,7 @@ def test_metrics_count_by_route_not_by_path(client, make_exr):
     assert 'deepshade_requests_total{route="/shade/{effect}",status="200"}' in text
     assert "made" not in text
     assert 'deepshade_stage_seconds_count{effect="ao",stage="infer"}' in text
+    assert 'deepshade_computed_pixels_total{effect="ao"}' in text
     assert "deepshade_resident_bytes" in text
 
 

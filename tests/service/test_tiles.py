@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from deepshade import exr
 from deepshade.gbuffer import load_gbuffer
 from deepshade_service import shading
-from deepshade_service.shading import Plan
+from deepshade_service.planner import Plan
 from deepshade_service.tiles import Tile, plan_tiles, smallest_tile
 
 EXR = {"Content-Type": "image/x-exr"}
