@@ -30,6 +30,7 @@ from deepshade.machine import cpu_count, describe
 from deepshade_client import answer
 from deepshade_service import shading
 from deepshade_service.app import Service, create_app
+from deepshade_service.calibration import chosen_path
 from deepshade_service.choice import Choices
 from deepshade_service.cli import listen
 from deepshade_service.config import Settings
@@ -37,7 +38,7 @@ from deepshade_service.parameters import ShadeParameters
 from deepshade_service.planner import Scene
 from deepshade_service.uploads import Upload
 
-TARGET = 1.5
+TARGET = 3.0
 STAGES = ("decode", "plan", "infer", "encode")
 
 
@@ -48,11 +49,18 @@ def main() -> int:
     parser.add_argument("--effect", default="ao")
     parser.add_argument("--rounds", type=int, default=40)
     parser.add_argument("--threads", type=int, default=cpu_count())
+    parser.add_argument("--quality", help="fast, balanced or best")
+    parser.add_argument(
+        "--calibration", default="", help="file of 'deepshade bench --calibrate', or 'off'"
+    )
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
 
     body = options.input.read_bytes() if options.input else analytic_picture(512, 768)
-    app = create_app(Settings(models=options.models, threads=options.threads))
+    calibration = chosen_path(options.calibration)
+    app = create_app(
+        Settings(models=options.models, threads=options.threads, calibration=calibration)
+    )
     listener = listen("127.0.0.1", 0)
     server = uvicorn.Server(uvicorn.Config(app, log_config=None, timeout_graceful_shutdown=5))
     thread = threading.Thread(target=server.run, args=([listener],))
@@ -60,7 +68,7 @@ def main() -> int:
     try:
         url = f"http://127.0.0.1:{listener.getsockname()[1]}"
         with httpx.Client(base_url=url, trust_env=False, timeout=60) as client:
-            result = measure(client, app.state.service, options.effect, body, options.rounds)
+            result = measure(client, app.state.service, options, body)
     finally:
         server.should_exit = True
         thread.join()
@@ -72,12 +80,13 @@ def main() -> int:
 
 
 def measure(
-    client: httpx.Client, service: Service, effect: str, body: bytes, rounds: int
+    client: httpx.Client, service: Service, options: argparse.Namespace, body: bytes
 ) -> dict[str, Any]:
-    """Times `rounds` pairs of a bare prediction and a request; all times in milliseconds."""
-    while client.get("/readyz").status_code != 200:
+    """Times pairs of a bare prediction and a request; all times in milliseconds."""
+    effect, rounds, asked = options.effect, options.rounds, ShadeParameters(quality=options.quality)
+    while (state := client.get("/readyz")).status_code != 200 or state.json().get("calibrating"):
         time.sleep(0.05)
-    chosen = Choices.of(service.models, effect, ShadeParameters()).plain
+    chosen = Choices.of(service.models, effect, asked).plain
     engine = service.models.engine(chosen)
     limits = service.settings.limits
     headers = [exr.read_header(body, limits)]
@@ -93,7 +102,7 @@ def measure(
     times: dict[str, list[float]] = {
         name: [] for name in ("network", "service", "transport", *STAGES)
     }
-    warm_up = 5
+    warm_up = 12  # engines prepare for sizes that come often
     for turn in range(warm_up + rounds):
         start = time.perf_counter()
         engine.predict(ready)
@@ -101,7 +110,10 @@ def measure(
 
         start = time.perf_counter()
         response = client.post(
-            f"/shade/{effect}", content=body, headers={"Content-Type": "image/x-exr"}
+            f"/shade/{effect}",
+            params={"quality": options.quality} if options.quality else {},
+            content=body,
+            headers={"Content-Type": "image/x-exr"},
         )
         total = 1e3 * (time.perf_counter() - start)
         response.raise_for_status()

@@ -35,6 +35,14 @@ EXTRAS: dict[str, tuple[tuple[str, str], ...]] = {
         ("flip_evaluator", "flip-evaluator"),
         ("PIL", "pillow"),
     ),
+    "report": (
+        ("matplotlib", "matplotlib"),
+        ("jinja2", "jinja2"),
+        ("safetensors", "safetensors"),
+        ("mitsuba", "mitsuba"),
+        ("mitsuba_oidn", "mitsuba-oidn"),
+        ("torch", "torch"),
+    ),
 }
 # imported by a package above rather than by us
 _INDIRECT = {"drjit": "workers", "starlette": "service", "pydantic": "service"}

@@ -27,8 +27,8 @@ from deepshade_service.uploads import Upload
 Float = NDArray[np.float32]
 Facts = dict[str, str | float | int]
 
-# A million radii away float32 no longer resolves one radius; what matters is to stay finite.
-_MOST_RADII = 1e6
+# So far away nothing depends on where exactly; what matters is to stay finite, in 16 bits too.
+_MOST_RADII = 6e4
 
 
 def decode(
@@ -224,7 +224,8 @@ def _scale(source: Float, divisor: float, out: Float) -> None:
     """Positions in radii, so bounded that they stay finite."""
     with np.errstate(over="ignore"):
         np.divide(source, np.float32(divisor), out=out)
-    np.clip(out, -_MOST_RADII, _MOST_RADII, out=out)
+    if out.size and (out.max() > _MOST_RADII or out.min() < -_MOST_RADII):
+        np.clip(out, -_MOST_RADII, _MOST_RADII, out=out)
 
 
 def _block(planes: list[Plane]) -> Float | None:

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -177,6 +177,7 @@ class _Network:
     def __init__(self, graphs: list[Any]) -> None:
         self.held = 0  # the largest prediction, in pixels, whose memory is still taken
         self._graphs = graphs
+        self._outputs = int(graphs[-1].output(0).get_partial_shape()[1].get_length())
         self._idle: list[list[Any]] = []
         self._lock = threading.Lock()
 
@@ -187,6 +188,9 @@ class _Network:
         given = Tensor(np.ascontiguousarray(gbuffer), shared_memory=True)
         with self._requests() as requests:
             handed: list[Any] = []
+            count, _, height, width = gbuffer.shape
+            shade = np.empty((count, self._outputs, height, width), np.float32)
+            requests[-1].set_output_tensor(0, Tensor(shade, shared_memory=True))
             for graph, request in zip(self._graphs, requests, strict=True):
                 inputs = [given] * (len(graph.inputs) - len(handed)) + handed
                 for index, tensor in enumerate(inputs):
@@ -194,7 +198,7 @@ class _Network:
                 request.infer(share_outputs=True)  # else every tensor is copied for Python
                 handed = [request.get_output_tensor(k) for k in range(len(graph.outputs))]
             self.held = max(self.held, gbuffer.size // gbuffer.shape[1])
-            return cast(Float, handed[0].data.copy())
+            return shade
 
     def release(self) -> None:
         """Give its memory back, unless it is running."""
