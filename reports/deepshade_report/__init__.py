@@ -1,0 +1,1 @@
+"""Speed against error, measured on the machine it runs on: `deepshade report`."""
