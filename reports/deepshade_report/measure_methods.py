@@ -36,30 +36,29 @@ def error(context: Context) -> dict[str, Any]:
     views = context.held_out
     found, missing = methods(context)
     white = [dssim(np.full_like(view.reference, _blank(context)), view) for view in views]
-    rows = []
-    for index, method in enumerate(found):
-        name = identity(method)
-        errors, failed = [], ""
-        for number, view in enumerate(views):
-            context.advance((index + number / len(views)) / len(found), name)
+    errors: dict[str, list[float]] = {identity(method): [] for method in found}
+    for number, view in enumerate(views):  # outermost: what traces rays keeps a view's scene
+        for index, method in enumerate(found):
+            name = identity(method)
+            if name in missing:
+                continue
+            context.advance((number + index / len(found)) / len(views), f"{view.scene}: {name}")
             try:
                 method.prepare(view)
-                errors.append(dssim(method.shade(view), view))
+                errors[name].append(dssim(method.shade(view), view))
             except DeepshadeError as problem:
-                failed = str(problem)
-                break
-        if failed:
-            missing[name] = failed
-            continue
-        rows.append(
-            {
-                **about(method),
-                "dssim": significant(fmean(errors)),
-                "ssim": significant(1 - 2 * fmean(errors)),
-                "of_trivial": significant(fmean(errors) / fmean(white)),
-                "each": [significant(value) for value in errors],
-            }
-        )
+                missing[name] = str(problem)
+    rows = [
+        {
+            **about(method),
+            "dssim": significant(fmean(each)),
+            "ssim": significant(1 - 2 * fmean(each)),
+            "of_trivial": significant(fmean(each) / fmean(white)),
+            "each": [significant(value) for value in each],
+        }
+        for method in found
+        if len(each := errors[identity(method)]) == len(views)
+    ]
     return {
         "views": len(views),
         "scenes": sorted({view.scene for view in views}),

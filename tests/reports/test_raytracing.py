@@ -153,7 +153,7 @@ def test_scene_files_are_found_from_other_folders(
 
 
 def test_all_settings_are_told_apart() -> None:
-    for quick, number in ((False, 16), (True, 3)):
+    for quick, number in ((False, 12), (True, 3)):
         found = raytracing.methods(quick)
         assert len({(m.name, *m.settings.values()) for m in found}) == len(found) == number
         assert all(raytracing.RayTracing.needs_scene for _ in found)

@@ -36,8 +36,8 @@ _TYPES = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
 _CAPABILITIES = {"fp32": "FP32", "bf16": "BF16", "fp16": "FP16", "int8": "INT8"}
 # After how many predictions a size is compiled, how many of them are kept, and the input pixels
 # for which memory is kept, over all of them.
-_OFTEN = 8
-_SIZES = 6
+_OFTEN = 4
+_SIZES = 12
 _LIVE_PIXELS = 4 * 2**20
 
 Shape = tuple[int, ...]
