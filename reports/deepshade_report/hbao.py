@@ -16,13 +16,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from deepshade_report import tuned
-from deepshade_report.horizons import Field, Slice, blocks, finish, march, open_field, slices
+from deepshade_report.horizons import Field, Slice, blocks, finish, march, slices
 from deepshade_report.method import Float, Method, View
+
+if TYPE_CHECKING:
+    from deepshade_report.compiled import Screen
 
 # directions and steps a direction, from cheap to best
 SETTINGS = ((4, 2), (4, 4), (8, 4), (8, 8), (16, 8))
@@ -91,17 +94,22 @@ class HBAO:
         self.directions, self.steps = directions, steps
         self.parameters = parameters or default()
         self.settings: dict[str, Any] = {"directions": directions, "steps": steps}
-        self._field: Field | None = None
+        self._screen: Screen | None = None
 
     def prepare(self, view: View) -> None:
-        """Puts the view's attributes into tensors, positions divided by the radius."""
-        self._field = open_field(view)
+        """Put the view on the device. Raises DeepshadeError without a libLLVM."""
+        from deepshade_report import compiled
+
+        self._screen = compiled.open_screen(view)
 
     def shade(self, view: View) -> Float:
         """(H, W) of the prepared view."""
-        field = self._field or open_field(view)
-        with torch.inference_mode():
-            return occlude(field, self.directions, self.steps, self.parameters)
+        from deepshade_report import compiled
+
+        if self._screen is None:
+            self.prepare(view)
+        assert self._screen is not None
+        return compiled.hbao(self._screen, self.directions, self.steps, self.parameters)
 
     def everything(self) -> dict[str, Any]:
         """The settings and all parameters, for a table."""

@@ -21,7 +21,7 @@ NEAREST = 1.3  # pixels between a pixel and its first sample, so that it never m
 BLOCK = 32768  # pixels at a time
 _FAR = -1e9  # depth of background and of what lies outside the picture: beyond any radius
 _TINY = 1e-12
-_GOLDEN = 0.61803398875
+GOLDEN = 0.61803398875
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def march(
     along = block.reach * reach
     for step in range(steps):
         # the golden ratio keeps slices from sampling the same distances (as XeGTAO does)
-        share = block.offset + ((index + step * steps) * _GOLDEN) % 1.0
+        share = block.offset + ((index + step * steps) * GOLDEN) % 1.0
         share = (share - share.floor()).add_(step).mul_(1 / steps)
         if spread != 1.0:
             share = share.pow_(spread)

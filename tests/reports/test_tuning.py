@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from deepshade_report import gtao, hbao, tuned, tuning
+from deepshade_report.horizons import open_field
 
 from .walls import rubble
 
@@ -35,7 +36,7 @@ def test_a_sweep_comes_near_what_the_reference_was_made_with() -> None:
     view = rubble()
     subject = replace(tuning.SUBJECTS[0], at=at, settings=[at])
     hidden = hbao.Parameters(intensity=2.0, power=2.0, bias=0.3)
-    view = replace(view, reference=subject.shade(hbao.open_field(view), *at, hidden))
+    view = replace(view, reference=subject.shade(open_field(view), *at, hidden))
     found = tuning.tune(subject, [view], seconds=0.4, seed=3, windows=1)
     assert found["trials"] > 3
     assert found["windows"]["ssim"] > found["windows"]["published"] + 0.01
