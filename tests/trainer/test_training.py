@@ -59,7 +59,9 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
 @pytest.mark.slow
 def test_a_killed_run_goes_on(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    settings = ["steps=100000", "batch=4", "network.widths=[8,12]", "precision=fp32"]
+    settings = ["steps=100000", "batch=4", "precision=fp32"]
+    settings += ["network.widths=[8,12]", "network.steps=[2]", "network.down=[1,1]"]
+    settings += ["network.up=[1]"]
     command = [sys.executable, "-m", "deepshade.cli", "train", "ao", "--data", str(data)]
     command += ["--out", str(out), *(x for s in settings for x in ("--set", s))]
     for _ in range(2):
