@@ -105,7 +105,7 @@ def search(
     """
     import torch
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from deepshade.machine import cpu_count
 
@@ -140,7 +140,8 @@ def search(
     if as_json:
         typer.echo(json.dumps([asdict(trial) for trial in best], indent=2))
         return
-    table = Table("ms at 768 x 512", "DSSIM", "x all white", "rung", "parameters", "network")
+    figures = ("ms at 768 x 512", "DSSIM", "x all white", "rung", "parameters")
+    table = Table(*figures, Column("network", overflow="fold"))
     for trial in best:
         table.add_row(
             f"{trial.ms:.2f}",
