@@ -19,8 +19,6 @@ from deepshade.exr import Header, Limits
 from deepshade.gbufferplan import Plan, chosen, framed, plan_gbuffer
 from deepshade.profiles import QUANTITIES
 
-__all__ = ["GBuffer", "Plan", "Source", "load_gbuffer", "plan_gbuffer", "source_name"]
-
 Source = Path | str | bytes | tuple[str, bytes]
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from deepshade.exr import Limits
-    from deepshade.gbuffer import Plan
+    from deepshade.gbufferplan import Plan
 
 
 def inspect(
@@ -58,7 +58,7 @@ def inspect_files(
     from deepshade import exr
     from deepshade.attributes import ATTRIBUTES
     from deepshade.effects import EFFECTS
-    from deepshade.gbuffer import plan_gbuffer
+    from deepshade.gbufferplan import plan_gbuffer
 
     limits = limits or exr.Limits()
     paths = [Path(file) for file in files]

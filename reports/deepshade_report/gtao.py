@@ -16,15 +16,16 @@ and S. McCalla, 2021); the thickness heuristic is the memo's (its section on thi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from deepshade_report import tuned
 from deepshade_report.horizons import Field, Slice, blocks, finish, march, slices
-from deepshade_report.method import Float, Method, View
+from deepshade_report.marching import Marching
+from deepshade_report.method import Float, Method
 
 if TYPE_CHECKING:
     from deepshade_report.compiled import Screen
@@ -106,36 +107,21 @@ def _arc(plane: Slice, horizon: Tensor, facing: Tensor) -> Tensor:
     return sides.mul_(0.25).mul_(plane.length).clamp_(min=0)
 
 
-class GTAO:
+class GTAO(Marching):
     """GTAO as a Method."""
 
     name = "GTAO"
-    family = "screen-space"
 
     def __init__(self, count: int, steps: int, parameters: Parameters | None = None) -> None:
+        super().__init__({"slices": count, "steps": steps})
         self.count, self.steps = count, steps
         self.parameters = parameters or default()
-        self.settings: dict[str, Any] = {"slices": count, "steps": steps}
-        self._screen: Screen | None = None
 
-    def prepare(self, view: View) -> None:
-        """Put the view on the device. Raises DeepshadeError without a libLLVM."""
+    def march(self, screen: Screen) -> Float:
+        """See `Marching.march`."""
         from deepshade_report import compiled
 
-        self._screen = compiled.open_screen(view)
-
-    def shade(self, view: View) -> Float:
-        """(H, W) of the prepared view."""
-        from deepshade_report import compiled
-
-        if self._screen is None:
-            self.prepare(view)
-        assert self._screen is not None
-        return compiled.gtao(self._screen, self.count, self.steps, self.parameters)
-
-    def everything(self) -> dict[str, Any]:
-        """The settings and all parameters, for a table."""
-        return {**self.settings, **asdict(self.parameters)}
+        return compiled.gtao(screen, self.count, self.steps, self.parameters)
 
 
 def default() -> Parameters:

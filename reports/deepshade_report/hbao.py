@@ -15,14 +15,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
 from deepshade_report import tuned
 from deepshade_report.horizons import Field, Slice, blocks, finish, march, slices
-from deepshade_report.method import Float, Method, View
+from deepshade_report.marching import Marching
+from deepshade_report.method import Float, Method
 
 if TYPE_CHECKING:
     from deepshade_report.compiled import Screen
@@ -84,36 +85,21 @@ def _start(plane: Slice, bias: float) -> torch.Tensor:
     return torch.where(cos < math.sin(bias), torch.maximum(sin, raised), raised)
 
 
-class HBAO:
+class HBAO(Marching):
     """HBAO as a Method."""
 
     name = "HBAO"
-    family = "screen-space"
 
     def __init__(self, directions: int, steps: int, parameters: Parameters | None = None) -> None:
+        super().__init__({"directions": directions, "steps": steps})
         self.directions, self.steps = directions, steps
         self.parameters = parameters or default()
-        self.settings: dict[str, Any] = {"directions": directions, "steps": steps}
-        self._screen: Screen | None = None
 
-    def prepare(self, view: View) -> None:
-        """Put the view on the device. Raises DeepshadeError without a libLLVM."""
+    def march(self, screen: Screen) -> Float:
+        """See `Marching.march`."""
         from deepshade_report import compiled
 
-        self._screen = compiled.open_screen(view)
-
-    def shade(self, view: View) -> Float:
-        """(H, W) of the prepared view."""
-        from deepshade_report import compiled
-
-        if self._screen is None:
-            self.prepare(view)
-        assert self._screen is not None
-        return compiled.hbao(self._screen, self.directions, self.steps, self.parameters)
-
-    def everything(self) -> dict[str, Any]:
-        """The settings and all parameters, for a table."""
-        return {**self.settings, **asdict(self.parameters)}
+        return compiled.hbao(screen, self.directions, self.steps, self.parameters)
 
 
 def default() -> Parameters:

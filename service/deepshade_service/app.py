@@ -17,12 +17,13 @@ from fastapi.responses import HTMLResponse, PlainTextResponse
 from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
+from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade_service import problems
 from deepshade_service.choice import Choices
 from deepshade_service.config import Settings
 from deepshade_service.job import Answer, Job
-from deepshade_service.memory import MemoryBudget, trim
+from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Candidate, Models, find_effect, not_ready
 from deepshade_service.parameters import ShadeParameters

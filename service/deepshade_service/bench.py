@@ -123,8 +123,9 @@ def _add_device_times(bundle: Bundle, rows: list[dict[str, Any]], threads: int) 
     import numpy as np
 
     from deepshade.engines import Backend, load_engine
+    from deepshade_service.tiles import padded
 
-    width, height = (-(-side // bundle.size_multiple) * bundle.size_multiple for side in _SIZE)
+    height, width = padded(_SIZE[1], _SIZE[0], bundle.size_multiple)
     for row in rows:
         if row["sha256"] == bundle.sha256:
             backend = Backend(row["engine"], row["precision"])

@@ -30,6 +30,7 @@ from deepshade.engines import REFERENCE, Backend, Engine, load_engine, usable
 from deepshade.errors import DeepshadeError
 from deepshade.files import replacing
 from deepshade.machine import describe
+from deepshade_service.tiles import padded
 
 log = logging.getLogger("deepshade.service")
 
@@ -196,7 +197,7 @@ def _measure(
     for size in _SIZES:
         if cancelled is not None and cancelled.is_set():
             return None
-        height, width = (_up(side, bundle.size_multiple) for side in size)
+        height, width = padded(*size, bundle.size_multiple)
         gbuffer = _picture(engine.channels, height, width, windows)
         engine.prepare(height, width)
         times.append((height * width / 1e6, _median_ms(engine, gbuffer)))
@@ -291,7 +292,3 @@ def _library(engine: str) -> str:
         except metadata.PackageNotFoundError:
             continue
     return engine
-
-
-def _up(value: int, multiple: int) -> int:
-    return -(-value // multiple) * multiple

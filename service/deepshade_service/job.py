@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 from deepshade import exr
 from deepshade.effects import EFFECTS
 from deepshade.engines import Engine, busy
+from deepshade.machine import trim
 from deepshade_service import shading
 from deepshade_service.choice import Choice, Choices
-from deepshade_service.memory import MemoryBudget, trim
+from deepshade_service.memory import MemoryBudget
 from deepshade_service.planner import Plan, Scene, explain
 from deepshade_service.pool import Cancelled
 from deepshade_service.room import Room, bytes_per_pixel, room_for, size_of

@@ -8,9 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from deepshade.errors import ConfigError
-from deepshade.machine import resident, trim
-
-__all__ = ["MemoryBudget", "parse_size", "resident", "trim"]
 
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
 

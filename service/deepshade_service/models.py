@@ -171,10 +171,6 @@ class Models:
         defaults = [one for one in fitting if one.default]
         return defaults[0] if defaults else min(fitting, key=_speed)
 
-    def pick(self, effect: str, name: str | None = None) -> Engine:
-        """The engine of a bundle's default, warm. Raises what `candidate` raises."""
-        return self.engine(self.candidate(effect, name))
-
     def engine(self, candidate: Candidate) -> Engine:
         """The candidate's engine, warm; blocks while it is loaded.
 

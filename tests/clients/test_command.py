@@ -225,7 +225,7 @@ def test_several_are_in_flight(start, views, tmp_path, monkeypatch):
     from deepshade_client import AsyncClient, Options
 
     local = start(workers=3)
-    engine = local.service.models.pick("ao")
+    engine = local.service.models.engine(local.service.models.candidate("ao"))
     barrier, predict = threading.Barrier(3, timeout=10), engine.predict
     engine.predict = lambda gbuffer: (barrier.wait(), predict(gbuffer))[1]
     tasks = plan([str(views)], str(tmp_path / "out"), effect="ao", suffix=".exr")
@@ -246,7 +246,7 @@ def test_ctrl_c_leaves_no_half_files(start, views, tmp_path):
 
     local = start(workers=1)
     gate = threading.Event()
-    engine = local.service.models.pick("ao")
+    engine = local.service.models.engine(local.service.models.candidate("ao"))
     predict = engine.predict
     engine.predict = lambda gbuffer: (gate.wait(20), predict(gbuffer))[1]
     out = tmp_path / "out"

@@ -11,7 +11,8 @@ import pytest
 
 from deepshade import exr
 from deepshade.errors import ConfigError
-from deepshade_service.memory import MemoryBudget, parse_size, resident, trim
+from deepshade.machine import resident, trim
+from deepshade_service.memory import MemoryBudget, parse_size
 from deepshade_service.room import room_for
 
 
@@ -60,7 +61,7 @@ def test_waiting_for_memory_can_be_given_up():
 
 
 def test_an_engine_gives_its_memory_back(service):
-    engine = service.service.models.pick("ao")
+    engine = service.service.models.engine(service.service.models.candidate("ao"))
     engine.shrink()
     trim()
     before = resident()
@@ -75,7 +76,7 @@ def test_an_engine_gives_its_memory_back(service):
 def test_an_idle_service_gives_its_memory_back(start, make_exr):
     local = start(idle_trim=0.1)
     calls = []
-    engine = local.service.models.pick("ao")
+    engine = local.service.models.engine(local.service.models.candidate("ao"))
     shrink = engine.shrink
     engine.shrink = lambda: (calls.append(time.monotonic()), shrink())
     local.client.post(
@@ -91,7 +92,7 @@ def test_an_idle_service_gives_its_memory_back(start, make_exr):
 
 def test_the_part_with_the_most_pixels_counts(service, make_exr):
     """Not the widest one: either may turn out to be the one that is shaded."""
-    engine = service.service.models.pick("ao")
+    engine = service.service.models.engine(service.service.models.candidate("ao"))
     wide, large = (exr.read_header(make_exr(*size)) for size in ((1, 101), (100, 100)))
     alone = room_for([large], engine, 2**30)
     together = room_for([wide, large], engine, 2**30)
@@ -106,7 +107,7 @@ def test_4k_stays_within_a_gibibyte_however_much_there_is(service, make_exr):
     part = exr.read_header(make_exr(2, 2, half=True)).parts[0]
     part = replace(part, data_window=(0, 0, 3839, 2159), decoded_bytes=2160 * 3840 * 12)
     header = exr.Header((part,), body_bytes=60 * 2**20)
-    bundle = service.service.models.pick("ao").bundle
+    bundle = service.service.models.engine(service.service.models.candidate("ao")).bundle
     engine = SimpleNamespace(bundle=bundle, channels=6, bytes_per_pixel=150)
     for total in (2**30, 2**33):
         room = room_for([header], engine, total)
@@ -141,7 +142,7 @@ def test_what_a_derivation_takes_is_counted(service, make_exr, make_picture, mon
         channels, half=True, compression="none", attributes={"worldToCamera": np.eye(4)}
     )
     header = exr.read_header(body)
-    engine = service.service.models.pick("ao")
+    engine = service.service.models.engine(service.service.models.candidate("ao"))
     monkeypatch.setattr(engine, "bytes_per_pixel", 1)  # as if the network took nothing
     needed = room_for([header], engine, 2**30).needed
     tracemalloc.start()

@@ -43,7 +43,7 @@ def test_the_least_error_comes_first(plain):
     assert {c.backend for c in candidates} == set(usable(candidates[0].bundle))
     assert plain.candidate("ao").bundle.name == "zbest"
     assert plain.candidate("ao", "worse").bundle.name == "worse"
-    assert plain.pick("ao", "worse").backend == REFERENCE
+    assert plain.engine(plain.candidate("ao", "worse")).backend == REFERENCE
 
 
 def test_what_can_not_be_had(plain, root):

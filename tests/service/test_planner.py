@@ -71,7 +71,7 @@ def test_channels_that_are_not_read_are_not_decoded(client, half):
 
 def test_explaining_runs_no_network(start, half, monkeypatch):
     local = start()
-    engine = local.service.models.pick("ao")
+    engine = local.service.models.engine(local.service.models.candidate("ao"))
     monkeypatch.setattr(engine, "predict", lambda gbuffer: 1 / 0)
     response = shade(local.client, half, "?explain=true")
     assert response.status_code == 200
@@ -79,7 +79,7 @@ def test_explaining_runs_no_network(start, half, monkeypatch):
 
 
 def test_what_is_computed_is_fast_to_plan_and_equals_the_whole(service, half):
-    engine = service.service.models.pick("ao")
+    engine = service.service.models.engine(service.service.models.candidate("ao"))
     gbuffer = load_gbuffer(half, engine.bundle.inputs)
     scene = Scene(gbuffer, EFFECTS["ao"])
     plan = scene.plan(engine.bundle, ShadeParameters(radius=0.5), 10**9)
@@ -192,7 +192,7 @@ def test_an_engine_that_is_not_here(client, half):
 
 @pytest.mark.parametrize("size", [(64, 96), (61, 90)])
 def test_a_consumed_gbuffer_gives_the_same_without_a_copy(service, make_exr, size):
-    engine = service.service.models.pick("ao")
+    engine = service.service.models.engine(service.service.models.candidate("ao"))
     seen = []
 
     class Spy:

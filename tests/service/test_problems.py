@@ -222,7 +222,7 @@ def test_slow_body_times_out_and_holds_no_worker(start, make_exr):
 def block(local):
     """Make every prediction wait for the returned event."""
     gate, started = threading.Event(), threading.Event()
-    engine = local.service.models.pick("ao")
+    engine = local.service.models.engine(local.service.models.candidate("ao"))
     predict = engine.predict
 
     def waiting(gbuffer):
@@ -326,7 +326,7 @@ def test_a_failure_inside_shows_no_traceback(start, make_exr):
     def fail(gbuffer):
         raise RuntimeError("secret detail")
 
-    local.service.models.pick("ao").predict = fail
+    local.service.models.engine(local.service.models.candidate("ao")).predict = fail
     response = shade(local.client, make_exr(64, 64))  # so few as 4 x 4 need no network
     problem(response, 500, "internal")
     assert "secret" not in response.text
@@ -335,7 +335,7 @@ def test_a_failure_inside_shows_no_traceback(start, make_exr):
 
 def test_a_network_that_answers_nan_is_an_error(start, make_exr):
     local = start()
-    engine = local.service.models.pick("ao")
+    engine = local.service.models.engine(local.service.models.candidate("ao"))
     engine.predict = lambda g: np.full((1, 1, *g.shape[2:]), np.nan, np.float32)
     problem(shade(local.client, make_exr(64, 64)), 500, "bad-answer")
 

@@ -68,7 +68,7 @@ def test_wide_pictures_are_cut_across():
     ("size", "most"), [((129, 257), 25_000), ((63, 265), 1), ((410, 40), 5_000), ((1, 300), 1)]
 )
 def test_tiled_equals_untiled(service, make_exr, size, most):
-    engine = service.service.models.pick("ao")
+    engine = service.service.models.engine(service.service.models.candidate("ao"))
     gbuffer = load_gbuffer(make_exr(*size), engine.bundle.inputs)
     gbuffer.background[::7, ::5] = True
     for array in gbuffer.attributes.values():
@@ -90,7 +90,7 @@ def test_tiled_equals_untiled(service, make_exr, size, most):
 
 def test_the_halo_matters(service, make_exr):
     """Without one the same comparison fails, so it can fail."""
-    engine = service.service.models.pick("ao")
+    engine = service.service.models.engine(service.service.models.candidate("ao"))
     gbuffer = load_gbuffer(make_exr(64, 64), engine.bundle.inputs)
     never = threading.Event()
     shades = [
@@ -107,10 +107,11 @@ def test_the_halo_matters(service, make_exr):
 
 def test_a_small_memory_setting_cuts_tiles_and_changes_nothing(start, client, make_exr):
     body = make_exr(300, 500)
-    engine_bytes = start().service.models.pick("ao").bytes_per_pixel
+    models = start().service.models
+    engine_bytes = models.engine(models.candidate("ao")).bytes_per_pixel
     held = len(body) + 300 * 500 * (24 + 4 + 12)
     local = start(memory=int((held + 60_000 * engine_bytes) / 0.75))
-    local.service.models.pick("ao").bytes_per_pixel = engine_bytes
+    local.service.models.engine(local.service.models.candidate("ao")).bytes_per_pixel = engine_bytes
     answers = [
         c.post("/shade/ao?half=false", content=body, headers=EXR) for c in (client, local.client)
     ]
