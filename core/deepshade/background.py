@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,44 +14,33 @@ Mask = NDArray[np.bool_]
 
 FAR = 1e10  # depths from here on mean that nothing was hit
 DEPTHS = ("depth", "distance")
+_BLOCK = 2**16  # pixels looked at together, so that the steps between stay in the cache
 
 
 @np.errstate(invalid="ignore")
-def find(arrays: Mapping[str, Array], suspects: Collection[str]) -> tuple[Mask, int]:
-    """(pixels without geometry, number of pixels that hold NaN or infinities).
+def remove(arrays: Mapping[str, Array], suspects: Collection[str]) -> tuple[Mask, int]:
+    """Sets to 0 what shows no geometry; (these pixels, number that held NaN or infinities).
 
-    `arrays` are (C, H, W) by quantity; only those named in `suspects` hold NaN or infinities.
-    Mostly there is little background to find: each quantity is first asked, by its extremes,
-    whether it shows any, because every pass over a picture counts.
+    `arrays` are (C, H, W) by quantity; only those named in `suspects` hold NaN or infinities,
+    and where they do all are set to 0 as well. Every pass over a picture counts: each quantity of
+    a block of rows is first asked, by its extremes, whether it shows any background, and not
+    asked where all are background already.
     """
-    shape = next(iter(arrays.values())).shape[1:]
-    background = np.zeros(shape, np.bool_)
-    broken, infinite = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
-    for name, array in arrays.items():
-        suspect = name in suspects
-        if name in DEPTHS:
-            depth = array[0]
-            if suspect or not (depth.min() > 0 and depth.max() < FAR):
-                background |= ~((depth > 0) & (depth < FAR))  # not for NaN
-            if suspect:  # an infinite depth is how renderers say that nothing was hit
-                infinite |= np.isposinf(depth)
-                broken |= np.isnan(depth) | np.isneginf(depth)
-            continue
-        if suspect:
-            broken |= nonfinite(array)
-        if name == "alpha":
-            if suspect or not array.min() > 0:
-                background |= array[0] <= 0
-        elif name == "position":
-            z = array[2]
-            if suspect or not (z.max() < 0 and z.min() > -FAR):
-                background |= ~((z != 0) & (np.abs(z) < FAR))
-        elif name in ("normal", "normal_world", "position_world"):
-            background |= _zero(array)
-    if not suspects:
-        return background, 0
-    broken &= ~infinite
-    return background | broken | infinite, int(np.count_nonzero(broken))
+    background = np.zeros(next(iter(arrays.values())).shape[1:], np.bool_)
+    count = 0
+    # those first of which one channel tells
+    asked = sorted(_EMPTY.keys() & arrays.keys(), key=list(_EMPTY).index)
+    for rows in _blocks(background.shape):
+        block = {name: array[:, rows] for name, array in arrays.items()}
+        empty = background[rows]
+        for name in asked:
+            _EMPTY[name](block[name], empty)
+            if empty.all():
+                break
+        if suspects:
+            count += _broken({name: block[name] for name in suspects}, empty)
+        _clear(block.values(), empty)
+    return background, count
 
 
 def nonfinite(array: Array) -> Mask:
@@ -63,21 +52,83 @@ def nonfinite(array: Array) -> Mask:
 
 def clear(arrays: Iterable[Array], background: Mask) -> None:
     """Sets (C, H, W) arrays to 0 where `background` (H, W) is true."""
+    arrays = list(arrays)
+    for rows in _blocks(background.shape):
+        _clear([array[:, rows] for array in arrays], background[rows])
+
+
+def _clear(arrays: Iterable[Array], background: Mask) -> None:
     if not background.any():
         return
     # a mask of bits: several times faster than a masked copy, and NaN can't survive it
-    keep = background.astype(np.int32)
-    keep -= 1
+    keep = None if background.all() else background.astype(np.int32) - np.int32(1)
     for array in arrays:
         bits = array.view(np.int32)
-        np.bitwise_and(bits, keep, out=bits)
+        if keep is not None:
+            np.bitwise_and(bits, keep, out=bits)
+        elif bits.view(np.uint32).max():  # mostly all are 0 already
+            bits[...] = 0
 
 
-def _zero(array: Array) -> Mask:
-    """(H, W): where all channels are 0. The last, which seldom is, first."""
-    zero = np.asarray(array[-1] == 0)
+def _broken(arrays: Mapping[str, Array], empty: Mask) -> int:
+    """Marks in `empty` where any of the arrays isn't finite; how many of them show geometry."""
+    broken, infinite = np.zeros_like(empty), np.zeros_like(empty)
+    for name, array in arrays.items():
+        if name in DEPTHS:  # an infinite depth is how renderers say that nothing was hit
+            infinite |= np.isposinf(array[0])
+            broken |= np.isnan(array[0]) | np.isneginf(array[0])
+        else:
+            broken |= nonfinite(array)
+    np.logical_or(empty, broken | infinite, out=empty)
+    return int(np.count_nonzero(broken & ~infinite))
+
+
+def _blocks(shape: tuple[int, ...]) -> list[slice]:
+    """Runs of the rows of a picture (H, W)."""
+    step = max(1, _BLOCK // max(1, shape[1]))
+    return [slice(top, top + step) for top in range(0, shape[0], step)]
+
+
+# Each marks the pixels, in some rows of a (C, H, W) quantity, where it shows no geometry.
+
+
+def _depth(array: Array, empty: Mask) -> None:
+    depth = array[0]
+    if not (depth.min() > 0 and depth.max() < FAR):
+        np.logical_or(empty, ~((depth > 0) & (depth < FAR)), out=empty)  # not for NaN
+
+
+def _alpha(array: Array, empty: Mask) -> None:
+    if not array.min() > 0:
+        np.logical_or(empty, array[0] <= 0, out=empty)
+
+
+def _position(array: Array, empty: Mask) -> None:
+    z = array[2]
+    low, high = z.min(), z.max()
+    if low == 0 == high:
+        empty[...] = True
+    elif not (high < 0 and low > -FAR):
+        np.logical_or(empty, z == 0, out=empty)
+        if not (high < FAR and low > -FAR):
+            np.logical_or(empty, ~(np.abs(z) < FAR), out=empty)
+
+
+def _vector(array: Array, empty: Mask) -> None:
+    zero = array[-1] == 0  # the last, which seldom is, first
     for plane in array[-2::-1]:
         if not zero.any():
-            break
+            return
         zero &= plane == 0
-    return zero
+    np.logical_or(empty, zero, out=empty)
+
+
+_EMPTY: dict[str, Callable[[Array, Mask], None]] = {
+    "depth": _depth,
+    "distance": _depth,
+    "alpha": _alpha,
+    "position": _position,
+    "normal": _vector,
+    "normal_world": _vector,
+    "position_world": _vector,
+}

@@ -20,7 +20,13 @@ from deepshade.llvm import find_libllvm, libllvm_version
 from deepshade.machine import cpu_count, cpu_quota, memory_bytes
 
 _GIB = 1024**3
-_CORE = (("numpy", "numpy"), ("OpenEXR", "OpenEXR"), ("typer", "typer"), ("rich", "rich"))
+_CORE = (
+    ("numpy", "numpy"),
+    ("OpenEXR", "OpenEXR"),
+    ("isal", "isal"),
+    ("typer", "typer"),
+    ("rich", "rich"),
+)
 
 
 @dataclass(frozen=True, slots=True)

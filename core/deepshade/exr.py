@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,10 +13,10 @@ import numpy as np
 import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 
-from deepshade import floats
+from deepshade import exrencode, floats
 from deepshade.errors import ImageError
 from deepshade.exrdecode import Wanted, decode
-from deepshade.exrheader import Header, Limits, Part, Window, parse
+from deepshade.exrheader import MAX_COORDINATE, Header, Limits, Part, Window, parse
 from deepshade.files import replacing
 from deepshade.threads import thread_count
 
@@ -32,7 +30,6 @@ __all__ = [
     "fetch",
     "read",
     "read_header",
-    "set_zip_level",
     "write",
 ]
 
@@ -45,9 +42,8 @@ COMPRESSIONS = {
     in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
 }
 
-_THREADED = {"zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256", "htj2k32"}
+_THREADED = {"piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256", "htj2k32"}
 _pool_owner = 0
-_zip_level: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,43 +148,37 @@ def write(
         raise ValueError(f"unknown compression '{compression}', one of: {', '.join(COMPRESSIONS)}")
     if not channels:
         raise ValueError("an image needs at least one channel")
-    planes = {name: _encodable(name, plane, half) for name, plane in channels.items()}
+    planes = {name: _plane(name, plane) for name, plane in channels.items()}
     shapes = {plane.shape for plane in planes.values()}
     if len(shapes) != 1:
         raise ValueError(f"channels differ in size: {sorted(shapes)}")
     height, width = shapes.pop()
-    frame = frame or (width, height)
+    halves = {name for name in planes if (half if isinstance(half, bool) else name in half)}
+    data_window = _window("data", *origin, width, height)
+    display_window = _window("display", 0, 0, *(frame or (width, height)))
     header = {key: _attribute(key, value) for key, value in (attributes or {}).items()}
-    header |= {
-        "compression": COMPRESSIONS[compression],
-        "type": OpenEXR.scanlineimage,
-        "dataWindow": _window(*origin, width, height),
-        "displayWindow": _window(0, 0, *frame),
-    }
-    if _zip_level is None:
-        set_zip_level(1)
-    with OpenEXR.File(header, planes, num_threads=_threads(compression)) as file:
-        if isinstance(target, (str, os.PathLike)):
-            with replacing(Path(target)) as temporary:
-                file.write(os.fspath(temporary))
-        else:
-            file.write(target)
 
+    def encode(stream: BinaryIO) -> None:
+        if compression in exrencode.COMPRESSIONS:
+            windows = data_window, display_window
+            for piece in exrencode.encode(planes, halves, *windows, compression, header):
+                stream.write(piece)
+            return
+        stored = {name: _encodable(plane, name in halves) for name, plane in planes.items()}
+        settings = header | {
+            "compression": COMPRESSIONS[compression],
+            "type": OpenEXR.scanlineimage,
+            "dataWindow": _corners(data_window),
+            "displayWindow": _corners(display_window),
+        }
+        with OpenEXR.File(settings, stored, num_threads=_threads(compression)) as file:
+            file.write(stream)
 
-def set_zip_level(level: int) -> None:
-    """How thoroughly files are compressed with ZIP from now on, 1 to 9, in the whole process.
-
-    `write` sets 1 if nobody has chosen: a third quicker than the library's own 4, for files that
-    are 5 % larger; 2 and 3 are hardly quicker than 4. The Python package has no setting for it,
-    but the C function (openexr_base.h) is in the same shared library on Linux and macOS. Where it
-    isn't, the library keeps its level.
-    """
-    global _zip_level
-    _zip_level = level
-    with suppress(OSError, AttributeError):
-        function = ctypes.CDLL(OpenEXR.__file__).exr_set_default_zip_compression_level
-        function.argtypes, function.restype = [ctypes.c_int], None
-        function(level)
+    if isinstance(target, (str, os.PathLike)):
+        with replacing(Path(target)) as temporary, temporary.open("wb") as stream:
+            encode(stream)
+    else:
+        encode(target)
 
 
 def fetch(source: Path | str | bytes, limits: Limits) -> bytes:
@@ -214,19 +204,18 @@ def _allocate(shapes: Sequence[tuple[str, tuple[int, int]]]) -> dict[str, Pixels
     return {name: next(blocks[shape]) for name, shape in shapes}
 
 
-def _encodable(name: str, plane: ArrayLike, half: bool | Collection[str]) -> NDArray[Any]:
+def _plane(name: str, plane: ArrayLike) -> NDArray[Any]:
     array = np.asarray(plane)
     if array.ndim != 2 or array.size == 0:
         raise ValueError(f"channel '{name}' has shape {array.shape}, it must be (height, width)")
     if array.dtype.kind not in "fiub":
         raise ValueError(f"channel '{name}' holds {array.dtype}, not numbers")
-    if half if isinstance(half, bool) else name in half:
-        if array.dtype != np.float16:
-            array = floats.to_half(array)
-    else:
-        array = array.astype(np.float32, copy=False)
-    # strided arrays are written wrongly without an error: OpenEXR issue 1929
-    return np.ascontiguousarray(array)
+    return array
+
+
+def _encodable(plane: NDArray[Any], half: bool) -> NDArray[Any]:
+    """What the library is given; strided arrays it writes wrongly without an error (issue 1929)."""
+    return floats.to_half(plane) if half else np.ascontiguousarray(plane, np.float32)
 
 
 def _attribute(key: str, value: Any) -> Any:
@@ -246,20 +235,24 @@ def _attribute(key: str, value: Any) -> Any:
     raise ValueError(f"the header attribute '{key}' can't hold {value!r:.60}")
 
 
-def _window(x0: int, y0: int, width: int, height: int) -> tuple[Any, Any]:
-    return (
-        np.array([x0, y0], np.int32),
-        np.array([x0 + width - 1, y0 + height - 1], np.int32),
-    )
+def _window(name: str, x0: int, y0: int, width: int, height: int) -> Window:
+    window = int(x0), int(y0), int(x0 + width - 1), int(y0 + height - 1)
+    if width < 1 or height < 1 or max(map(abs, window)) > MAX_COORDINATE:
+        raise ValueError(f"no EXR can hold the {name} window {window} (x0, y0, x1, y1)")
+    return window
+
+
+def _corners(window: Window) -> tuple[Any, Any]:
+    return np.array(window[:2], np.int32), np.array(window[2:], np.int32)
 
 
 def _threads(compression: str) -> int:
     """How many threads the library may use to write a file; starts its pool on first use.
 
-    Only compressions that pack many scanlines into a chunk gain (ZIP halves its time on two
-    cores); with one scanline a chunk, handing over costs more than encoding. The pool is empty by
-    default, which means serial. A forked child inherits its size but none of its threads, and
-    would wait for them forever: there it is 0.
+    Only compressions that pack many scanlines into a chunk gain; with one scanline a chunk,
+    handing over costs more than encoding. The pool is empty by default, which means serial. A
+    forked child inherits its size but none of its threads, and would wait for them forever: there
+    it is 0.
     """
     global _pool_owner
     if compression not in _THREADED or thread_count() == 1:

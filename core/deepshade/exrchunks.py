@@ -9,6 +9,7 @@ Layout: "OpenEXR File Layout", openexr.com/en/latest/OpenEXRFileLayout.html.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,29 +75,38 @@ class Chunks:
         height = self.window[3] - self.window[1] + 1
         return slice(first * self.height, min(last * self.height, height))
 
-    def cut(self, data: Buffer, first: int, last: int) -> bytes:
-        """A single-part EXR file of the rows of chunks `first` to before `last`.
+    def places(self, data: Buffer, first: int, last: int) -> list[tuple[int, int]]:
+        """Where the pixels of the chunks in these rows begin, and how many bytes they are."""
+        size_before = struct.Struct("<i").unpack_from
+        begins = self.table(data)[first * self.across : last * self.across] + np.uint64(self.head)
+        return [(begin, size_before(data, begin - 4)[0]) for begin in begins.tolist()]
+
+    def cut(self, data: Buffer, rows: Sequence[int]) -> bytes:
+        """A single-part EXR file of these rows of chunks, in ascending order, without gaps.
 
         Raises DamagedImageError when they hold other tiles than they should.
         """
         x0, y0, x1, _ = self.window
-        lines = self.lines_of(first, last)
-        window = struct.pack("<4i", x0, y0 + lines.start, x1, y0 + lines.stop - 1)
+        lines = self.lines_of(rows[0], rows[-1] + 1)
+        gaps = (rows[-1] + 1 - rows[0] - len(rows)) * self.height
+        y0 += lines.start
+        window = struct.pack("<4i", x0, y0, x1, y0 + lines.stop - lines.start - gaps - 1)
         pieces: list[bytes | Buffer] = []
         sizes = []
-        skipped = 0 if self.number is None else 4
-        table = self.table(data)[first * self.across : last * self.across]
-        for index, offset in enumerate(table.tolist()):
-            start, begin = offset + skipped, offset + self.head
-            (size,) = struct.unpack_from("<i", data, begin - 4)
-            if self.tiled:
-                row, column = divmod(index, self.across)
-                if struct.unpack_from("<4i", data, start) != (column, first + row, 0, 0):
-                    raise DamagedImageError("a chunk holds another tile than its table entry says")
-                pieces.append(struct.pack("<5i", column, row, 0, 0, size))
-                start = begin
-            pieces.append(data[start : begin + size])
-            sizes.append(self.head - skipped + size)
+        places = self.places(data, rows[0], rows[-1] + 1)
+        for index, row in enumerate(rows):
+            for column in range(self.across):
+                begin, size = places[(row - rows[0]) * self.across + column]
+                if self.tiled:
+                    if struct.unpack_from("<4i", data, begin - 20) != (column, row, 0, 0):
+                        raise DamagedImageError(
+                            "a chunk holds another tile than its table entry says"
+                        )
+                    head = struct.pack("<5i", column, index, 0, 0, size)
+                else:
+                    head = struct.pack("<2i", y0 + index * self.height, size)
+                pieces += (head, data[begin : begin + size])
+                sizes.append(len(head) + size)
         begin = len(self.header) + len(_WINDOW) + len(window) + 1 + 8 * len(sizes)
         starts = np.cumsum([begin, *sizes[:-1]], dtype="<u8")
         return b"".join((self.header, _WINDOW, window, b"\0", starts.tobytes(), *pieces))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,11 +19,16 @@ from deepshade.exrheader import Part
 from deepshade.threads import run_all, thread_count
 
 Pixels = NDArray[np.float32]
+Repeats = Mapping[int, Sequence[int]]
 
 # Bytes decoded at a time, with all the part's channels. Smaller strips take less memory and keep
 # more threads busy; but opening the library's file for each takes some 50 µs.
 _MOST = 8 * 2**20
 _LEAST = 2**20
+
+# Bytes of a decoded chunk from which on it is decoded once if it is there several times: less
+# is decoded sooner than set apart.
+_WORTH_COMPARING = 2**14
 
 _TYPES: dict[str, np.dtype[Any]] = {
     "half": np.dtype("<f2"),
@@ -46,40 +52,98 @@ class Wanted:
 def decode(data: bytes, wanted: Sequence[Wanted]) -> None:
     """Fills the planes of all the parts that are `wanted` from the bytes of their file.
 
-    Raises DamagedImageError.
+    Chunks with the same bytes, as background has, are decoded once. Raises DamagedImageError.
     """
     threads = thread_count()
-    total = sum(each.part.decoded_bytes for each in wanted)
-    piece = min(_MOST, max(_LEAST, -(-total // threads)))
+    distinct = [_distinct(data, each.part) for each in wanted]
+    shares = [
+        each.part.decoded_bytes * len(rows) // each.part.chunks.rows
+        for each, (rows, _) in zip(wanted, distinct, strict=True)
+    ]
+    piece = min(_MOST, max(_LEAST, -(-sum(shares) // threads)))
     strips = [
-        (each, first, last)
-        for each in wanted
-        for first, last in _strips(each.part, -(-each.part.decoded_bytes // piece))
+        (each, strip, repeats)
+        for each, (rows, repeats), share in zip(wanted, distinct, shares, strict=True)
+        for strip in _strips(each.part, rows, -(-share // piece))
     ]
     run_all(lambda strip: _decode(data, *strip), strips, threads)
 
 
-def _strips(part: Part, count: int) -> list[tuple[int, int]]:
-    """`count` runs of the part's rows of chunks, if it has as many and can be cut."""
-    rows = part.chunks.rows
+def _distinct(data: bytes, part: Part) -> tuple[Sequence[int], Repeats]:
+    """(rows of chunks with different bytes, and for each of these the rows that repeat it)."""
+    chunks = part.chunks
+    every = range(chunks.rows)
+    if part.tiled or part.subsampled or part.compression == "none":
+        return every, {}
+    if part.decoded_bytes < _WORTH_COMPARING * chunks.rows:
+        return every, {}
+    whole = part.shape[0] // chunks.height  # the last may have fewer scanlines than the others
+    places = chunks.places(memoryview(data), 0, whole)
+    # most differ in their sizes or last bytes (a checksum in ZIP): only the rest is compared whole
+    ends = [(size, data[max(at, at + size - 8) : at + size]) for at, size in places]
+    counts = Counter(ends)
+    if len(counts) == whole:
+        return every, {}
+    first: dict[bytes, int] = {}
+    repeats: dict[int, list[int]] = {}
+    rows: list[int] = []
+    for row, (at, size) in enumerate(places):
+        source = first.setdefault(data[at : at + size], row) if counts[ends[row]] > 1 else row
+        if source == row:
+            rows.append(row)
+        else:
+            repeats.setdefault(source, []).append(row)
+    return [*rows, *every[whole:]], repeats
+
+
+def _strips(part: Part, rows: Sequence[int], count: int) -> list[Sequence[int]]:
+    """`count` runs of these rows of chunks, if there are as many and they can be cut."""
     # subsampled lines must not be counted from the top of a strip
-    count = 1 if part.subsampled else min(count, rows)
-    bounds = [rows * k // count for k in range(count + 1)]
-    return list(itertools.pairwise(bounds))
+    count = 1 if part.subsampled else min(count, len(rows))
+    bounds = [len(rows) * k // count for k in range(count + 1)]
+    return [rows[first:last] for first, last in itertools.pairwise(bounds)]
 
 
-def _decode(data: bytes, wanted: Wanted, first: int, last: int) -> None:
+def _runs(rows: Sequence[int]) -> list[range]:
+    """Ascending rows as runs of consecutive ones."""
+    if isinstance(rows, range):
+        return [rows]
+    runs: list[range] = []
+    for row in rows:
+        if runs and runs[-1].stop == row:
+            runs[-1] = range(runs[-1].start, row + 1)
+        else:
+            runs.append(range(row, row + 1))
+    return runs
+
+
+def _decode(data: bytes, wanted: Wanted, rows: Sequence[int], repeats: Repeats) -> None:
+    """Fills these rows of chunks, and all that repeat one of them."""
     chunks = wanted.part.chunks
-    lines = chunks.lines_of(first, last)
-    stored = _uncompressed(data, wanted, first, last)
+    runs = [chunks.lines_of(run.start, run.stop) for run in _runs(rows)]
+    height = sum(lines.stop - lines.start for lines in runs)
+    copies = [
+        (chunks.lines_of(row, row + 1), chunks.lines_of(run.start, run.stop))
+        for row in rows
+        if row in repeats
+        for run in _runs(repeats[row])
+    ]
+    stored = _uncompressed(data, wanted, rows[0], rows[-1] + 1)
     if stored is None:
-        stored = _by_library(chunks.cut(memoryview(data), first, last))
+        stored = _by_library(chunks.cut(memoryview(data), rows))
     for name, plane in wanted.planes.items():
         pixels = stored.get(name)
-        if pixels is None or pixels.shape != plane[lines].shape:
+        if pixels is None or pixels.shape != (height, plane.shape[1]):
             raise DamagedImageError(f"the image is damaged: channel '{name}' is incomplete")
-        if not _convert(pixels, plane[lines]):
-            wanted.nonfinite.add(name)
+        top = 0
+        for lines in runs:
+            bottom = top + lines.stop - lines.start
+            if not _convert(pixels[top:bottom], plane[lines]):
+                wanted.nonfinite.add(name)
+            top = bottom
+        for source, target in copies:
+            each = plane[source]
+            np.copyto(plane[target].reshape(-1, *each.shape), each)
 
 
 def _by_library(data: bytes) -> dict[str, NDArray[Any]]:

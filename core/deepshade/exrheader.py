@@ -24,7 +24,7 @@ from deepshade.exrlimits import Limits
 
 __all__ = ["Header", "Limits", "Part", "Window", "parse"]
 
-_MAX_COORDINATE = 2**30 - 2  # OpenEXR's own bound on windows
+MAX_COORDINATE = 2**30 - 2  # OpenEXR's own bound on windows
 _MAX_TILE = 2**16
 _BYTES = {"uint": 4, "half": 2, "float": 4}
 
@@ -223,7 +223,7 @@ def _checked_window(raw: RawPart, name: str, where: str) -> Window:
     x0, y0, x1, y1 = raw.attributes[name]
     if x1 < x0 or y1 < y0:
         raise DamagedImageError(f"{where}the {name} is empty: ({x0}, {y0}) to ({x1}, {y1})")
-    if max(map(abs, (x0, y0, x1, y1))) > _MAX_COORDINATE:
+    if max(map(abs, (x0, y0, x1, y1))) > MAX_COORDINATE:
         raise DamagedImageError(f"{where}the {name} is absurd: ({x0}, {y0}) to ({x1}, {y1})")
     return x0, y0, x1, y1
 

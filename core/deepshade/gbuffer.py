@@ -92,8 +92,7 @@ def load_gbuffer(
     if planned.camera:
         planned.camera = framed(planned.camera, part)
     arrays, suspects = _read(bodies, headers, choices, limits)
-    empty, nonfinite = background.find(arrays, suspects)
-    background.clear(arrays.values(), empty)
+    empty, nonfinite = background.remove(arrays, suspects)
     if steps:
         empty, more = _derive(steps.values(), planned, arrays, empty)
         nonfinite += more

@@ -24,6 +24,7 @@ _PACKAGES = (
     "onnxruntime",
     "openvino",
     "OpenEXR",
+    "isal",
     "mitsuba",
     "pyoidn",
 )

@@ -79,8 +79,8 @@ def emptied(view: View, share: float, shape: str = "sky") -> View:
     there = ~background
     return replace(
         view,
-        normal=view.normal * there,
-        position=view.position * there,
+        normal=np.where(there, view.normal, np.float32(0)),
+        position=np.where(there, view.position, np.float32(0)),
         background=background,
         reference=np.where(background, np.float32(1), view.reference),
     )
