@@ -24,6 +24,7 @@ from deepshade.errors import DeepshadeError
 STAGES = ("decode", "plan", "infer", "encode")
 _MAIN = "import sys; from deepshade.cli import main; sys.exit(main())"
 _START = 90.0  # seconds for the service to become ready
+_STILL = 2  # hundredths of a second of CPU time, of 0.3 s, that are nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +167,21 @@ class Server:
             lowest = min(lowest, self.resident)
         return lowest
 
+    def rest(self, seconds: float) -> None:
+        """Wait until it computes nothing, at most so many seconds.
+
+        It compiles what came often in the background, while it answers. Where the system doesn't
+        say what it computes, all these seconds are waited.
+        """
+        deadline = time.monotonic() + seconds
+        before = self._ticks()
+        while time.monotonic() < deadline:
+            time.sleep(0.3)
+            now = self._ticks()
+            if now is not None and before is not None and now - before <= _STILL:
+                return
+            before = now
+
     def stop(self) -> None:
         """End it, by force if it doesn't end within 20 s."""
         if self.process.poll() is None:
@@ -220,6 +236,13 @@ class Server:
         self._log.seek(0)
         last = self._log.read().decode("utf-8", "replace").strip().splitlines()[-3:]
         return DeepshadeError(f"the service {what}: {' '.join(last) or 'it printed nothing'}")
+
+    def _ticks(self) -> int | None:
+        """Hundredths of a second of CPU time that it has used; None where it isn't known."""
+        with suppress(OSError, ValueError, IndexError):
+            stat = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+            return int(stat[11]) + int(stat[12])
+        return None
 
     def _status(self, field: str) -> int:
         with suppress(OSError):

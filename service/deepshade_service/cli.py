@@ -45,7 +45,7 @@ def serve(
     threads: Annotated[
         int | None, typer.Option(min=1, help="Of a network run. Default: the CPUs we may use.")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Pictures shaded at a time.")] = 2,
+    workers: Annotated[int, typer.Option(min=1, help="Pictures shaded at a time.")] = 3,
     queue: Annotated[int, typer.Option(min=0, help="Pictures that may wait; then 429.")] = 16,
     memory: Annotated[
         str | None,

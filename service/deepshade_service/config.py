@@ -45,7 +45,7 @@ class Settings:
     calibration: Path | None = None
     limits: Limits = field(default_factory=default_limits)
     threads: int = field(default_factory=cpu_count)
-    workers: int = 2
+    workers: int = 3  # of two, both sometimes wait for a lock, and a CPU is idle
     queue: int = 16
     memory: int = field(default_factory=default_memory)
     uploads: int = 0

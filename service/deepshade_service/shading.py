@@ -65,12 +65,12 @@ def infer(
     """Run the network tile by tile: (C', H, W), the effect's background where there is none.
 
     What no tile answers is background, or known. `consume` allows to scale the G-buffer's own
-    positions in place, which spares time and memory; it is of no use afterwards. Raises
+    positions in place, where that spares a copy of them; it is of no use afterwards. Raises
     Cancelled between tiles when the event is set.
     """
     effect = EFFECTS[engine.bundle.effect]
     divisors = _divisors(engine.bundle, plan.radius)
-    if consume:
+    if consume and any(tile.shape == gbuffer.shape for tile in plan.tiling):
         for name, divisor in divisors.items():
             for plane in gbuffer.attributes[name]:
                 _scale(plane, divisor, plane)
@@ -84,12 +84,16 @@ def infer(
             if cancelled.is_set():
                 raise Cancelled
             rows, columns = tile.rows, tile.columns
-            answer = engine.predict(cut(planes, tile))[0]
-            out[:, rows.first : rows.last, columns.first : columns.last] = answer[
+            answer = engine.predict(cut(planes, tile))[
+                0,
                 :,
                 rows.first - rows.start : rows.last - rows.start,
                 columns.first - columns.start : columns.last - columns.start,
             ]
+            if answer.shape == shade.shape:
+                shade = answer  # all of it at once: no copy
+            else:
+                out[:, rows.first : rows.last, columns.first : columns.last] = answer
     if gbuffer.background.any():
         np.copyto(shade, np.float32(effect.background), where=gbuffer.background)
     if plan.known is not None:

@@ -90,6 +90,36 @@ def slopes(tmp_path_factory) -> Bundle:
     return bundle(tmp_path_factory.mktemp("engines") / "slopes", graph())
 
 
+def sliced(begin: int, end: int) -> onnx.ModelProto:
+    """Convolves some channels of a G-buffer, and adds another one's square, spread to all."""
+    nodes = [
+        helper.make_node("Slice", ["gbuffer", "begin", "end", "axis", "step"], ["some"]),
+        helper.make_node("Conv", ["some", "kernel"], ["seen"], pads=[1, 1, 1, 1]),
+        helper.make_node("Slice", ["gbuffer", "two", "three", "axis", "step"], ["one"]),
+        helper.make_node("Mul", ["one", "one"], ["square"]),
+        helper.make_node("Add", ["seen", "square"], ["shade"]),
+    ]
+    kernel = np.random.default_rng(0).normal(size=(1, min(end, 6) - begin, 3, 3))
+    constants = {"kernel": kernel.astype(np.float32)}
+    for name, value in {
+        "begin": begin,
+        "end": end,
+        "two": 2,
+        "three": 3,
+        "axis": 1,
+        "step": 1,
+    }.items():
+        constants[name] = np.array([value])
+    made = helper.make_graph(
+        nodes,
+        "sliced",
+        [helper.make_tensor_value_info("gbuffer", TensorProto.FLOAT, ["N", 6, "H", "W"])],
+        [helper.make_tensor_value_info("shade", TensorProto.FLOAT, ["N", 1, "H", "W"])],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    return helper.make_model(made, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+
+
 def far_away(height: int = 32, width: int = 48) -> np.ndarray:
     """A rough surface about a thousand effect radii away."""
     rng = np.random.default_rng(3)
@@ -136,6 +166,36 @@ def test_any_size_and_batch(slopes, backend):
     view = rotated.swapaxes(2, 3)  # not contiguous
     expected = reference(graph(), np.ascontiguousarray(view))
     assert np.abs(engine.predict(view) - expected).max() < 32 * TOLERANCE[backend.precision]
+
+
+@pytest.mark.parametrize("backend", HERE, ids=str)
+@pytest.mark.parametrize(("begin", "end"), [(0, 4), (3, 2**31 - 1), (2, 3)])
+def test_channels_are_read_where_they_lie(tmp_path, backend, begin, end):
+    model = sliced(begin, end)
+    engine = load_engine(bundle(tmp_path / "b", model), backend, threads=2)
+    engine.prepare(16, 24)
+    rng = np.random.default_rng(1)
+    for shape in ((1, 6, 8, 12), (1, 6, 16, 24), (3, 6, 16, 24)):
+        gbuffer = rng.normal(size=shape).astype(np.float32)
+        expected = reference(model, gbuffer)
+        shade = engine.predict(gbuffer)
+        assert np.abs(shade - expected).max() < TOLERANCE[backend.precision] * np.ptp(expected)
+
+
+@pytest.mark.skipif(Backend("openvino", "fp32") not in HERE, reason="OpenVINO isn't installed")
+def test_pieces_are_given_the_channels_that_they_take():
+    from openvino import Core
+
+    from deepshade.engines.cutting import cut, whole
+
+    model = Core().read_model(sliced(0, 4).SerializeToString())
+    first, rest = cut(model.clone())
+    assert first.exact
+    assert first.channels == (slice(2, 3),)
+    assert rest.channels == (slice(0, 4),)
+    assert [entry.get_partial_shape()[1] for entry in rest.model.inputs] == [4, 1]
+    (only,) = whole(model.clone())
+    assert {(each.start, each.stop) for each in only.channels} == {(0, 4), (2, 3)}
 
 
 @pytest.mark.parametrize("backend", HERE, ids=str)

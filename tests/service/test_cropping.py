@@ -193,6 +193,26 @@ def test_each_reach_matters(net, name):
 
 
 @pytest.mark.usefixtures("eager")
+@pytest.mark.parametrize("size", [(48, 64), (47, 63)])
+@pytest.mark.parametrize("part", [1, 3])  # of the width that is covered: all, or a third
+def test_scaling_in_place_changes_nothing(size, part):
+    covered = np.zeros(size, bool)
+    covered[:, : size[1] // part] = True
+    answers = []
+    for consume in (False, True):
+        gbuffer = view(np.random.default_rng(5), covered)
+        engine = NETS[2].engine()
+        plan = Scene(gbuffer, EFFECTS["ao"]).plan(engine.bundle, ShadeParameters(radius=0.3), 10**9)
+        answers.append(shading.infer(gbuffer, plan, engine, NEVER, consume=consume))
+    np.testing.assert_array_equal(*answers)
+    net = NETS[2]
+    planes = [gbuffer.attributes["normal"], gbuffer.attributes["position"]]
+    if part == 1 and not any(length % 2 for length in size):  # `consume` has scaled them
+        whole = net(np.concatenate(planes).astype(np.float64))
+        np.testing.assert_allclose(answers[0], whole, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.usefixtures("eager")
 def test_one_pixel():
     for covered in (np.ones((1, 1), bool), np.zeros((1, 1), bool)):
         gbuffer = view(np.random.default_rng(0), covered)

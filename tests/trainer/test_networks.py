@@ -17,9 +17,17 @@ PAPER = {
     "mb": (16, 5, 4, 1, 133_057),
 }
 SMALL = NetworkConfig(
-    widths=(8, 12, 16), steps=(2, 2), down=(1, 2, 2), up=(1, 2), fold=2, around=4, sample=2
+    widths=(8, 12, 16),
+    steps=(2, 2),
+    down=(1, 2, 2),
+    up=(1, 2),
+    fold=2,
+    rings=(1, 2),
+    fine_rings=(1, 1, 3),
 )
-WIDE = NetworkConfig(widths=(8, 12), steps=(4,), down=(0, 2), up=(1,), fold=4, around=8, sample=8)
+WIDE = NetworkConfig(
+    widths=(8, 12), steps=(4,), down=(0, 2), up=(1,), fold=4, rings=(1, 1), fine_rings=(1, 2, 5, 4)
+)
 SMALL_PAPER = NetworkConfig(kind="paper", widths=(4, 8, 16))
 
 
@@ -78,7 +86,10 @@ def test_a_pixel_beyond_the_halo_changes_nothing(config: NetworkConfig) -> None:
 
 @pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE])
 def test_needs_are_exactly_what_gradients_reach(config: NetworkConfig) -> None:
-    """Weights are positive and no rectifier clips: every path counts, so the bound must be met."""
+    """Weights are positive and no rectifier clips: every path counts, so the bound must be met.
+
+    Except that of several points only the highest makes a horizon: over a few random scenes, any.
+    """
     torch.manual_seed(0)
     model = build(config).double().train()
     with torch.no_grad():
@@ -88,14 +99,17 @@ def test_needs_are_exactly_what_gradients_reach(config: NetworkConfig) -> None:
     side = 2 * step * -(-halo // step) + step
     for offset in (0, 1, step // 2, step - 1):
         column = side // 2 // step * step + offset
-        gbuffer = 0.1 * torch.rand(1, 6, step, side, dtype=torch.float64)
-        gbuffer[:, :3] += 1
-        gbuffer[:, 5] -= 5
-        gbuffer.requires_grad_()
-        with torch.enable_grad():
-            model(gbuffer)[0, 0, :, column].sum().backward()
-        assert gbuffer.grad is not None
-        columns = torch.nonzero(gbuffer.grad.abs().sum((0, 1, 2)))
+        reached = torch.zeros(side, dtype=torch.bool)
+        for _ in range(1 if config.kind == "paper" else 12):
+            gbuffer = 0.1 * torch.rand(1, 6, step, side, dtype=torch.float64)
+            gbuffer[:, :3] += 1
+            gbuffer[:, 5] -= 5
+            gbuffer.requires_grad_()
+            with torch.enable_grad():
+                model(gbuffer)[0, 0, :, column].sum().backward()
+            assert gbuffer.grad is not None
+            reached |= gbuffer.grad.abs().sum((0, 1, 2)) > 0
+        columns = torch.nonzero(reached)
         assert (int(columns.min()), int(columns.max())) == model.needs(column)
 
 

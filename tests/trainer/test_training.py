@@ -56,6 +56,34 @@ def test_a_stopped_run_ends_where_an_uninterrupted_one_does(
         assert torch.equal(tensor, found[name]), name
 
 
+def test_a_run_starts_from_another_ones_average(data: Path, tmp_path: Path, recipe: Recipe) -> None:
+    """Weights that both have are taken over; what only the new network has begins at random."""
+    first, second = Run(tmp_path / "first"), Run(tmp_path / "second")
+    list(train(recipe, [data], first))
+    changed = {"steps": 1, "rate": 1e-9, "decay": 0.0, "start": str(first.folder)}
+    *down, last = recipe.network.down
+    (progress,) = train(
+        recipe.changed(network={"down": [*down, last + 1]}, **changed), [data], second
+    )
+    assert "encode" in progress.warning
+    taken, given = weights(second), weights(first)
+    assert set(given) < set(taken)
+    for name, tensor in given.items():
+        assert torch.allclose(taken[name], tensor, atol=1e-6), name
+
+
+def test_a_start_that_is_no_run_or_another_network_is_refused(
+    data: Path, tmp_path: Path, recipe: Recipe
+) -> None:
+    with pytest.raises(ConfigError, match="no run to start from"):
+        next(train(recipe.changed(start=str(tmp_path)), [data], Run(tmp_path / "run")))
+    paper = preset("paper", "ao").changed(batch=recipe.batch, steps=1, held_out=0.0)
+    paper = paper.changed(network={"widths": [4, 8]})
+    list(train(paper, [data], Run(tmp_path / "paper")))
+    with pytest.raises(ConfigError, match="no weights in common"):
+        next(train(recipe.changed(start=str(tmp_path / "paper")), [data], Run(tmp_path / "run")))
+
+
 @pytest.mark.slow
 def test_a_killed_run_goes_on(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"

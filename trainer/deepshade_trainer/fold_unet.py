@@ -7,7 +7,6 @@ import math
 import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -15,23 +14,22 @@ from torch.nn import functional as F
 
 from deepshade.errors import ConfigError
 
+from .horizons import DIRECTIONS, horizons, sampled, unit
 from .networks import NetworkConfig, Shader
 from .spans import Span, folded, grown, joined
 
 # Levels whose cells are this many pixels wide keep those without geometry at zero.
 _MASKED = 16
-# Neighbours (rows down, columns right), nearest first.
-_AROUND = [(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1), (1, -1), (-1, -1), (-1, 1)]
+# What a coarse cell is told: normal, R/z, coverage, horizons.
+_TOLD = 5 + DIRECTIONS
 
 
 class FoldUNet(Shader):
     """Our network: pixels folded into channels, dense convolutions, geometry at every scale.
 
-    `fold` x `fold` pixels become one cell: their normals, their depths relative to the cell's mean,
-    their coverage. At every coarser level each cell is told how far the cells around it rise above
-    its own tangent plane, and how near they are, in units of the effect radius: what occludes it.
-    All of that is float32 arithmetic before the first convolution, so that engines can run the
-    convolutions in 16 or 8 bits while no large position ever matters to one.
+    The normals of `fold` x `fold` pixels become one cell. At every level each cell is told its
+    `horizons`: what occludes it. They are float32 arithmetic before the first convolution, so that
+    engines can run the convolutions in 16 or 8 bits while no large position ever matters to one.
 
     Nothing has a bias where there is no geometry, and coarse cells without geometry are kept at
     zero: to the pixels around it background is the same as the edge of the picture.
@@ -52,17 +50,16 @@ class FoldUNet(Shader):
                 "widths",
                 detail="down needs an entry for each of the widths, up and steps one fewer",
             )
-        if self._sizes[min(1, levels - 1)] % config.sample:
-            raise ConfigError("sample", detail="sample must divide the second level's cells")
+        for name in ("rings", "fine_rings"):
+            if len(rings := getattr(config, name)) < 2 or 0 in rings:
+                raise ConfigError(name, detail=f"{name} needs two distances, of 1 cell or more")
         place = config.position
         # Raw positions are too large for a convolution in 16 bits; everything else is welcome.
         self.raw = [k for k in range(config.inputs) if not place <= k < place + 3]
         self.door = nn.Conv2d(len(self.raw), widths[0], config.fold, stride=config.fold, bias=False)
-        self.relief = nn.Conv2d(cells, widths[0], 1, bias=False)
         pairs = list(zip(itertools.pairwise(widths), config.steps, strict=True))
-        self.tell = nn.ModuleList(
-            nn.Conv2d(5 + 2 * config.around, width, 1, bias=False) for width in widths[1:]
-        )
+        self.horizon = nn.Conv2d(DIRECTIONS, widths[0], 1, bias=False)
+        self.tell = nn.ModuleList(nn.Conv2d(_TOLD, width, 1, bias=False) for width in widths[1:])
         self.encode = nn.ModuleList(map(_stack, widths, config.down))
         self.shrink = nn.ModuleList(
             nn.Conv2d(fine, coarse, step, stride=step, bias=False) for (fine, coarse), step in pairs
@@ -78,8 +75,8 @@ class FoldUNet(Shader):
 
     @property
     def size_multiple(self) -> int:
-        """One cell of the coarsest level, and whole samples of the second."""
-        return math.lcm(self._sizes[-1], self.config.sample)
+        """One cell of the coarsest level."""
+        return self._sizes[-1]
 
     @property
     def _sizes(self) -> list[int]:
@@ -108,26 +105,33 @@ class FoldUNet(Shader):
             skips.append(span)
             span = span[0] // step, span[1] // step
         pixels = (pixel, pixel)
-        middle = config.sample // 2
         for n in reversed(range(len(config.widths))):
             if n < len(skips):
                 span = joined(folded(span, config.steps[n]), skips[n])
             span = grown(span, config.down[n])
-            if n:  # what its cells are told is seen through their neighbours' samples
-                first, last = folded(grown(span, 1), self._sizes[n])
-                pixels = joined(pixels, (first + middle, last + 1 - config.sample + middle))
+            size = self._sizes[n]
+            first, last = grown(span, max(config.rings if n else config.fine_rings))
+            pixels = joined(pixels, (self._sampled_at(first, size), self._sampled_at(last, size)))
         return joined(pixels, folded(span, config.fold))
+
+    def _sampled_at(self, cell: int, size: int) -> int:
+        """The pixel that stands for a cell of `size` pixels: see `features`."""
+        fold = self.config.fold
+        return cell * size + size // fold // 2 * fold + fold // 2
 
     def forward(self, gbuffer: Tensor) -> Tensor:
         """See `Shader.forward`."""
         with _full_precision():
-            relief, covered, told, masks = self.features(gbuffer)
-        # Cutting the positions out would cost more than multiplying them by zero.
+            near, told, masks = self.features(gbuffer)
         place, weight = self.config.position or 0, self.door.weight
-        blank = torch.zeros_like(weight[:, :1]).expand(-1, 3, -1, -1)
-        weight = torch.cat([weight[:, :place], blank, weight[:, place:]], 1)
-        x = F.conv2d(gbuffer, weight, stride=self.config.fold)
-        x = F.relu(x + self.relief(relief))
+        if place + 3 == gbuffer.shape[1]:
+            # All that is raw comes first. An odd number of channels would be slower in 16 bits.
+            raw = gbuffer[:, : place + place % 2]
+            weight = torch.cat([weight, torch.zeros_like(weight[:, : place % 2])], 1)
+        else:
+            raw = torch.cat([gbuffer[:, :place], gbuffer[:, place + 3 :]], 1)
+        x = F.conv2d(raw, weight, stride=self.config.fold)
+        x = F.relu(x + self.horizon(near))
         skips = []
         for n, stack in enumerate(self.encode):
             if n:
@@ -142,68 +146,39 @@ class FoldUNet(Shader):
             image = self.head(x.to(self.head.weight.dtype)).float()
             if not self.training:
                 image = image.clamp(0, 1)
-            covered = covered.repeat(1, self.config.outputs, 1, 1)
-            image = (image - self.background) * covered + self.background
-            return F.pixel_shuffle(image, self.config.fold)
+            image = F.pixel_shuffle(image, self.config.fold)
+            covered = _covered(gbuffer[:, place : place + 3])
+            return (image - self.background) * covered + self.background
 
-    def features(self, gbuffer: Tensor) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor | None]]:
+    def features(self, gbuffer: Tensor) -> tuple[Tensor, list[Tensor], list[Tensor | None]]:
         """What the positions of a G-buffer (N, inputs, H, W) tell, all in float32.
 
-        Returns each pixel's depth relative to its cell's mean, and its coverage, both
-        (N, fold², h, w); for each level but the first what its cells are told
-        (N, 5 + 2 around, ...); and for each level its mask of cells with geometry, or None.
+        Returns the first level's horizons (N, 8, h, w); for each level but the first what its cells
+        are told (N, 13, ...); and for each level its mask of cells with geometry, or None.
         """
         config = self.config
         start, place = config.normal or 0, config.position or 0
-        depth = gbuffer[:, place + 2 : place + 3]
-        depth = space_to_depth(depth, config.fold)
-        # 1 where there is geometry: nearer than 1e-4 radii nothing can be.
-        present = (depth * -1e4).clamp(0, 1)
-        count = present.sum(1, keepdim=True)
-        # Added, not subtracted: some engines rewrite subtractions in lower precision.
-        mean = depth.sum(1, keepdim=True) * (1 / count.clamp_min(1))
-        # From 0 (far nearer than the mean) to 2 (far behind it); 0 as well where there is nothing.
-        relief = (depth * -4 + (mean * 4 + count.clamp(0, 1))).clamp(0, 2)
-        # Few pixels stand for their cells: the mean of all would cost as much as the rest.
         six = gbuffer
         if (start, place, gbuffer.shape[1]) != (0, 3, 6):
             six = torch.cat([gbuffer[:, start : start + 3], gbuffer[:, place : place + 3]], 1)
-        seen = _sampled(six, config.sample)
-        cells = F.avg_pool2d(count * config.fold**-2.0, self._sizes[1] // config.fold)
-        near = torch.cat([seen, (seen[:, 5:6] * -1e4).clamp(0, 1)], 1)
+        # One pixel stands for its cell. A mean would lie in the air where a cell shows an edge.
+        seen = sampled(six, config.fold)
+        seen = torch.cat([unit(seen[:, :3]), seen[:, 3:], _covered(seen[:, 3:])], 1)
+        cells = seen[:, 6:]
         told: list[Tensor] = []
         masks: list[Tensor | None] = [None]
-        size = config.sample
-        for n, coarser in enumerate(self._sizes[1:], 1):
-            if coarser > size:
-                near = F.avg_pool2d(near, coarser // size)
-                size = coarser
-            if n > 1:
-                cells = F.avg_pool2d(cells, config.steps[n - 1])
-            told.append(self._tell(near, cells))
-            masks.append((cells * 1e6).clamp(0, 1) if coarser >= _MASKED else None)
-        return relief, present, told, masks
+        for step, size in zip(config.steps, self._sizes[1:], strict=True):
+            cells = F.avg_pool2d(cells, step)
+            here = sampled(seen, size // config.fold)
+            nearness = here[:, 6:] * (1 / (here[:, 5:6] * -1).clamp_min(0.25))
+            told.append(torch.cat([here[:, :3], nearness, cells, horizons(here, config.rings)], 1))
+            masks.append((cells * 1e6).clamp(0, 1) if size >= _MASKED else None)
+        return horizons(seen, config.fine_rings), told, masks
 
-    def _tell(self, samples: Tensor, covered: Tensor) -> Tensor:
-        """(N, 5 + 2 around, h, w): normal, R/z, coverage; each neighbour's rise and nearness."""
-        normal = samples[:, :3]
-        normal = normal * torch.rsqrt(normal.square().sum(1, keepdim=True) + 1e-12)
-        here = samples[:, 3:7] * (1 / samples[:, 6:7].clamp_min(1e-4))  # mean position, and 1 or 0
-        mask = here[:, 3:]
-        nearness = mask * (1 / (here[:, 2:3] * -1).clamp_min(0.25))
-        height, width = here.shape[2:]
-        wide = F.pad(here, (1, 1, 1, 1))
-        around = _AROUND[: self.config.around]
-        there = [wide[:, :, 1 + r : 1 + r + height, 1 + c : 1 + c + width] for r, c in around]
-        x, y, z = (
-            torch.cat([t[:, k : k + 1] for t in there], 1) + here[:, k : k + 1] * -1
-            for k in range(3)
-        )
-        square = x * x + y * y + z * z
-        near = torch.cat([t[:, 3:] for t in there], 1) * mask * (1 / (1 + square * 2))
-        rise = x * normal[:, :1] + y * normal[:, 1:2] + z * normal[:, 2:]
-        rise = rise * torch.rsqrt(square + 1e-6) * near
-        return torch.cat([normal, nearness, covered, rise, near], 1)
+
+def _covered(position: Tensor) -> Tensor:
+    """(N, 1, h, w): 1 where there is geometry; nearer than 1e-4 radii nothing can be."""
+    return (position[:, 2:3] * -1e4).clamp(0, 1)
 
 
 class Stack(nn.ModuleList):
@@ -230,38 +205,6 @@ def _stack(width: int, count: int) -> Stack:
         with torch.no_grad():
             weight.add_(torch.randn_like(weight), alpha=0.3 * (2 / (9 * width)) ** 0.5)
     return stack
-
-
-class _SpaceToDepth(torch.autograd.Function):
-    """Exports as ONNX's SpaceToDepth, which engines run fast, as they don't the transposition."""
-
-    @staticmethod
-    def symbolic(g: Any, x: Any, size: int) -> Any:
-        return g.op("SpaceToDepth", x, blocksize_i=size)
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, size: int) -> Tensor:
-        return _space_to_depth(x, size)
-
-
-def _space_to_depth(x: Tensor, size: int) -> Tensor:
-    n, c, h, w = x.shape
-    blocks = x.reshape(n, c, h // size, size, w // size, size).permute(0, 3, 5, 1, 2, 4)
-    return blocks.reshape(n, c * size**2, h // size, w // size)
-
-
-def space_to_depth(x: Tensor, size: int) -> Tensor:
-    """(N, C, H, W) to (N, size² C, H/size, W/size), a pixel's channels together."""
-    if torch.onnx.is_in_onnx_export():
-        return _SpaceToDepth.apply(x, size)  # type: ignore[no-any-return,no-untyped-call]
-    return _space_to_depth(x, size)
-
-
-def _sampled(x: Tensor, size: int) -> Tensor:
-    """(N, C, H/size, W/size): the middle pixel of each block; rows first, which is fastest."""
-    n, c, h, w = x.shape
-    x = x.reshape(n, c, h // size, size, w)[:, :, :, size // 2]
-    return x.reshape(n, c, h // size, w // size, size)[:, :, :, :, size // 2]
 
 
 @contextmanager

@@ -24,10 +24,10 @@ class NetworkConfig:
 
     `kind` is "paper" or "fold". `widths` are the channels of each level, finest first. The paper's
     has convolutions of `kernel` x `kernel`. Ours folds `fold` x `fold` pixels into channels, its
-    levels are `steps` times coarser than the one before, have `down` convolutions of 3 x 3 on the
-    way down and `up` on the way up, and all but the first are told about `around` neighbours, seen
-    through one pixel in `sample` x `sample`. `normal` and `position` are the first of their three
-    input channels, None without them.
+    levels are `steps` times coarser than the one before, and have `down` convolutions of 3 x 3 on
+    the way down and `up` on the way up. Every level is told its `horizons`, found `rings` cells
+    away, the first `fine_rings`. `normal` and `position` are the first of their three input
+    channels, None without them.
     """
 
     kind: str = "fold"
@@ -38,8 +38,8 @@ class NetworkConfig:
     down: tuple[int, ...] = (1, 2, 2)
     up: tuple[int, ...] = (2, 2)
     fold: int = 4
-    around: int = 8
-    sample: int = 4
+    rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
+    fine_rings: tuple[int, ...] = (1, 2, 5, 12)
     kernel: int = 3
     normal: int | None = 0
     position: int | None = 3

@@ -46,7 +46,8 @@ class Recipe:
 
     `optimizer` is "adamw" or "adadelta"; `schedule` "cosine" (after `warmup` steps) or
     "constant"; `precision` "bf16" or "fp32"; `ema` the weight average's decay a step (0: none);
-    `clip` bounds the gradient's norm (0: none).
+    `clip` bounds the gradient's norm (0: none). `start` is the folder of a run whose averaged
+    weights to begin with, where names and shapes agree ("": at random).
     """
 
     effect: str = "ao"
@@ -64,6 +65,7 @@ class Recipe:
     steps: int = 7500
     seed: int = 0
     held_out: float = 0.04
+    start: str = ""
 
     def __post_init__(self) -> None:
         """Raise ConfigError for a value that no run could mean."""
@@ -146,8 +148,7 @@ FAST: dict[str, Any] = {
         "steps": (4, 2),
         "down": (0, 2, 2),
         "up": (1, 2),
-        "around": 4,
-        "sample": 8,
+        "rings": (1, 1, 2, 2),
     }
 }
 BEST: dict[str, Any] = {

@@ -45,8 +45,7 @@ _STEPS = ((2,), (4,), (2, 2), (4, 2), (2, 4), (4, 4), (2, 2, 2), (4, 2, 2), (2, 
 _FIRST_WIDTHS = (16, 24, 32, 48, 64, 96)
 _WIDTH_GROWTHS = (1.0, 1.25, 1.5, 2.0)
 _MOST_WIDTH = 256
-_AROUND = (4, 8)
-_SAMPLES = (4, 8)
+_RINGS = ((1, 2), (1, 1, 2, 2), (1, 2, 4, 8), (1, 2, 5, 12), (1, 1, 2, 2, 4, 4))
 
 
 @dataclass(frozen=True)
@@ -239,8 +238,8 @@ def _drawn(like: NetworkConfig, rng: np.random.Generator) -> NetworkConfig:
         widths=tuple(min(_MOST_WIDTH, 8 * round(width * growth**n / 8)) for n in levels),
         down=tuple(int(rng.integers(0 if n == 0 else 1, 4)) for n in levels),
         up=tuple(int(rng.integers(0, 4)) for _ in steps),
-        around=int(rng.choice(_AROUND)),
-        sample=int(rng.choice(_SAMPLES)),
+        rings=_RINGS[rng.integers(len(_RINGS))],
+        fine_rings=_RINGS[rng.integers(len(_RINGS))],
     )
 
 
@@ -257,7 +256,7 @@ def _changed(old: NetworkConfig, rng: np.random.Generator) -> NetworkConfig:
         {"down": tuple(down)},
         {"up": tuple(up)},
         {"fold": other.fold},
-        {"around": other.around, "sample": other.sample},
+        {"rings": other.rings, "fine_rings": other.fine_rings},
     ]
     if len(other.steps) == len(old.steps):
         options.append({"steps": other.steps})
@@ -283,8 +282,8 @@ def _parse(line: str) -> Trial:
 
 def label(network: NetworkConfig) -> str:
     """A network in one word, which may name a file."""
-    widths, steps, down, up = (
-        "-".join(map(str, values))
-        for values in (network.widths, network.steps, network.down, network.up)
+    lists = (network.widths, network.steps, network.down, network.up)
+    widths, steps, down, up, rings, fine = (
+        "-".join(map(str, values)) for values in (*lists, network.rings, network.fine_rings)
     )
-    return f"f{network.fold}w{widths}s{steps}d{down}u{up}a{network.around}n{network.sample}"
+    return f"f{network.fold}w{widths}s{steps}d{down}u{up}r{rings}n{fine}"

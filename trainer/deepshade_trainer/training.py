@@ -102,6 +102,8 @@ class _Trainer:
 
     def _resume(self) -> int:
         if not self.run.checkpoint.exists():
+            if self.recipe.start:
+                self._begin_with(Run(Path(self.recipe.start)))
             self.recipe.write(self.run.recipe)
             return 0
         begun = Recipe.read(self.run.recipe)
@@ -117,6 +119,26 @@ class _Trainer:
         self.average = {k: v.to(self.device) for k, v in groups["average"].items()}
         self.optimizer.load_state_dict(optimizer)
         return step
+
+    def _begin_with(self, other: Run) -> None:
+        """Take another run's averaged weights, where it has such; the rest stays random."""
+        if not other.checkpoint.is_file():
+            raise ConfigError("start", detail=f"there is no run to start from in {other.folder}")
+        groups, _, _ = other.load()
+        own = self.model.state_dict()
+        known = {
+            name: weight
+            for name, weight in groups.get("average", {}).items()
+            if name in own and own[name].shape == weight.shape
+        }
+        if not known:
+            raise ConfigError(
+                "start", detail=f"{other.folder} is of another network: no weights in common"
+            )
+        self.model.load_state_dict({**own, **known})
+        self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+        if fresh := sorted(own.keys() - known.keys()):
+            self.warnings.append(f"not in {other.folder}, so begun at random: {', '.join(fresh)}")
 
     def steps(self, stopped: Callable[[], bool]) -> Iterator[Progress]:
         from torch.utils.tensorboard import SummaryWriter

@@ -9,9 +9,10 @@
 Nothing heavy is imported before it is asked for.
 """
 
-from deepshade.engines.base import Backend, Engine, busy
+from deepshade.engines.base import Backend, Engine
 from deepshade.engines.registry import REFERENCE, available, known, load_engine, usable
 from deepshade.errors import EngineError
+from deepshade.threads import busy
 
 __all__ = [
     "REFERENCE",

@@ -1,11 +1,8 @@
-"""The interface of an engine, and what all of them share: who runs at the same time."""
+"""The interface of an engine, and what all of them share."""
 
 from __future__ import annotations
 
-import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +12,7 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade.machine import resident, trim
+from deepshade.threads import busy
 
 Float = NDArray[np.float32]
 
@@ -98,37 +96,3 @@ def channels_of(bundle: Bundle) -> int:
         1 if single and ATTRIBUTES[name].kind == "colour" else len(ATTRIBUTES[name].channels)
         for name in bundle.inputs
     )
-
-
-class _Crowd(threading.local):
-    """Whether this thread counts already."""
-
-    counted = False
-
-
-_here = _Crowd()
-_lock = threading.Lock()
-_count = 0
-
-
-@contextmanager
-def busy() -> Iterator[int]:
-    """Count this thread as one that needs the CPU; gives how many do, itself included.
-
-    Predictions that run at the same time share the CPUs rather than fight for them. A prediction
-    counts by itself; work with predictions inside it may count as a whole.
-    """
-    global _count
-    if _here.counted:
-        yield _count
-        return
-    with _lock:
-        _count += 1
-        now = _count
-    _here.counted = True
-    try:
-        yield now
-    finally:
-        _here.counted = False
-        with _lock:
-            _count -= 1

@@ -29,7 +29,7 @@ import numpy as np
 
 from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine, Float
-from deepshade.engines.cutting import cut
+from deepshade.engines.cutting import cut, whole
 from deepshade.errors import EngineError
 
 _TYPES = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
@@ -134,22 +134,21 @@ class OpenVino(Engine):
         try:
             if shape is not None:
                 model.reshape(list(shape))
-            exact, rest = (model, None) if self._type == "f32" else cut(model)
+            pieces = whole(model) if self._type == "f32" else cut(model)
             settings = {
                 "INFERENCE_NUM_THREADS": self.threads,
                 "NUM_STREAMS": max(1, self.threads // threads),
                 "ENABLE_CPU_PINNING": False,  # several graphs would be pinned to the same cores
                 "CPU_RUNTIME_CACHE_CAPACITY": "0",
             }
-            return _Network(
-                [
-                    _core().compile_model(
-                        part, "CPU", {**settings, "INFERENCE_PRECISION_HINT": kind}
-                    )
-                    for part, kind in ((exact, "f32"), (rest, self._type))
-                    if part is not None
-                ]
-            )
+            types = ["f32" if piece.exact else self._type for piece in pieces]
+            graphs = [
+                _core().compile_model(
+                    piece.model, "CPU", {**settings, "INFERENCE_PRECISION_HINT": kind}
+                )
+                for piece, kind in zip(pieces, types, strict=True)
+            ]
+            return _Network(graphs, [piece.channels for piece in pieces])
         except RuntimeError as error:
             raise EngineError(
                 f"OpenVINO can't compile {self.bundle.effect}/{self.bundle.name} "
@@ -170,13 +169,14 @@ class OpenVino(Engine):
 class _Network:
     """One compiled graph, or two that follow each other, and requests to run them with.
 
-    The inputs of the second graph are the G-buffer, if it needs it, and after it what the first
-    graph puts out (see `cut`).
+    Of each graph the first inputs are these `channels` of the picture (see `cut`), and the others
+    what the graph before it puts out.
     """
 
-    def __init__(self, graphs: list[Any]) -> None:
+    def __init__(self, graphs: list[Any], channels: list[tuple[slice, ...]]) -> None:
         self.held = 0  # the largest prediction, in pixels, whose memory is still taken
         self._graphs = graphs
+        self._channels = channels
         self._outputs = int(graphs[-1].output(0).get_partial_shape()[1].get_length())
         self._idle: list[list[Any]] = []
         self._lock = threading.Lock()
@@ -185,15 +185,18 @@ class _Network:
         """(N, C, H, W) to (N, C', H, W)."""
         from openvino import Tensor
 
-        given = Tensor(np.ascontiguousarray(gbuffer), shared_memory=True)
         with self._requests() as requests:
             handed: list[Any] = []
             count, _, height, width = gbuffer.shape
             shade = np.empty((count, self._outputs, height, width), np.float32)
             requests[-1].set_output_tensor(0, Tensor(shade, shared_memory=True))
-            for graph, request in zip(self._graphs, requests, strict=True):
-                inputs = [given] * (len(graph.inputs) - len(handed)) + handed
-                for index, tensor in enumerate(inputs):
+            for graph, channels, request in zip(
+                self._graphs, self._channels, requests, strict=True
+            ):
+                # Views, for one picture. They must outlive the prediction.
+                views = [np.ascontiguousarray(gbuffer[:, each]) for each in channels]
+                given = [Tensor(view, shared_memory=True) for view in views]
+                for index, tensor in enumerate([*given, *handed]):
                     request.set_input_tensor(index, tensor)
                 request.infer(share_outputs=True)  # else every tensor is copied for Python
                 handed = [request.get_output_tensor(k) for k in range(len(graph.outputs))]
