@@ -78,17 +78,18 @@ def _distinct(data: bytes, part: Part) -> tuple[Sequence[int], Repeats]:
     if part.decoded_bytes < _WORTH_COMPARING * chunks.rows:
         return every, {}
     whole = part.shape[0] // chunks.height  # the last may have fewer scanlines than the others
-    places = chunks.places(memoryview(data), 0, whole)
+    view = memoryview(data)
+    places = chunks.places(view, 0, whole)
     # most differ in their sizes or last bytes (a checksum in ZIP): only the rest is compared whole
     ends = [(size, data[max(at, at + size - 8) : at + size]) for at, size in places]
     counts = Counter(ends)
     if len(counts) == whole:
         return every, {}
-    first: dict[bytes, int] = {}
+    first: dict[memoryview, int] = {}  # of the bytes, none of which is copied
     repeats: dict[int, list[int]] = {}
     rows: list[int] = []
     for row, (at, size) in enumerate(places):
-        source = first.setdefault(data[at : at + size], row) if counts[ends[row]] > 1 else row
+        source = first.setdefault(view[at : at + size], row) if counts[ends[row]] > 1 else row
         if source == row:
             rows.append(row)
         else:

@@ -142,6 +142,11 @@ def _header(
     for name, default in _REQUIRED.items():
         if values[name][0] != (kind := _value(default)[0]):
             raise ValueError(f"the header attribute '{name}' must be {kind}, not {values[name][0]}")
+    aspect, width = (
+        {**_REQUIRED, **attributes}[name] for name in ("pixelAspectRatio", "screenWindowWidth")
+    )
+    if not (0 < aspect < float("inf") and 0 <= width < float("inf")):
+        raise ValueError(f"no EXR has a pixel aspect of {aspect} or a screen window {width} wide")
     for name in ("channels", "lineOrder", "chunkCount"):
         if name in attributes:
             raise ValueError(f"the header attribute '{name}' can't be chosen")

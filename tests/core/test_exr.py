@@ -285,6 +285,13 @@ def patched(name, kind, value, **settings):
         ("dataWindow", "box2i", struct.pack("<4i", 5, 5, 4, 4), DamagedImageError),
         ("dataWindow", "box2i", struct.pack("<4i", 0, 0, 32, 10**6), DamagedImageError),
         ("displayWindow", "box2i", struct.pack("<4i", 0, 0, -1, -1), DamagedImageError),
+        # moved to the origin, as answers are, it would leave what an EXR can hold
+        (
+            "displayWindow",
+            "box2i",
+            struct.pack("<4i", *[-(2**30)] * 2, *[2**30] * 2),
+            DamagedImageError,
+        ),
         ("compression", "compression", b"\xfe", ImageError),
         ("channels", "chlist", b"Y\0" + struct.pack("<i", 99), DamagedImageError),
     ],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -127,7 +129,22 @@ def test_tiles_with_a_halo_equal_the_whole(config: NetworkConfig) -> None:
     assert (inner - whole[:, :, step + halo : 2 * step + halo]).abs().max() < 1e-5
 
 
-@pytest.mark.parametrize("config", [SMALL, WIDE])
+def leaking(fold: int, steps: tuple[int, ...], down: tuple[int, ...], up: tuple[int, ...]) -> Any:
+    """A network whose background is held back by few masks only."""
+    widths = (8,) * len(down)
+    return NetworkConfig(
+        widths=widths, steps=steps, down=down, up=up, fold=fold, rings=(1, 1), fine_rings=(1, 1)
+    )
+
+
+LEAKING = [
+    leaking(8, (2,), (0, 2), (2,)),
+    leaking(8, (2,), (0, 1), (3,)),
+    leaking(4, (2, 2, 2), (0, 0, 2, 2), (3, 3, 0)),
+]
+
+
+@pytest.mark.parametrize("config", [SMALL, WIDE, *LEAKING])
 def test_background_beyond_its_halo_changes_nothing(config: NetworkConfig) -> None:
     model = awake(config)
     step, margin = model.size_multiple, model.background_halo

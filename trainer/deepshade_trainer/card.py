@@ -125,6 +125,8 @@ def write_card(bundle: Bundle, run: Run, note: str) -> None:
                     f"| {mean['ratio']:.3f} |"
                 )
         lines += ["", *_backends(bundle)]
+    # A path of this machine tells nobody anything; the folder's name is what the note speaks of.
+    recipe = recipe.changed(start=Path(recipe.start).name)
     lines += ["## Recipe", "", "```json", json.dumps(asdict(recipe), indent=1), "```", ""]
     text = "\n".join(lines) + ("\n" + note.strip() + "\n" if note else "")
     with replacing(bundle.path / "README.md") as temporary:

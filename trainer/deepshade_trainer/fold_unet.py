@@ -51,7 +51,7 @@ class FoldUNet(Shader):
                 detail="down needs an entry for each of the widths, up and steps one fewer",
             )
         for name in ("rings", "fine_rings"):
-            if len(rings := getattr(config, name)) < 2 or 0 in rings:
+            if len(rings := getattr(config, name)) < 2 or min(rings) < 1:
                 raise ConfigError(name, detail=f"{name} needs two distances, of 1 cell or more")
         place = config.position
         # Raw positions are too large for a convolution in 16 bits; everything else is welcome.
@@ -87,12 +87,27 @@ class FoldUNet(Shader):
     def background_halo(self) -> int:
         """See `Shader.background_halo`.
 
-        What leaks into background at the unmasked levels must get out and back to matter; there
-        it goes no further than their convolutions reach.
+        What leaks into background must get out and back to matter. Unmasked levels let it go as far
+        as their convolutions reach; the finest masked level that convolves on the way up, as far
+        as those after its last mask: two cells if their number is even, else one.
         """
-        config, leak = self.config, self.config.fold
-        for size, down, up in zip(self._sizes, config.down, (*config.up, 0), strict=True):
-            leak += size * (down + up) if size < _MASKED else 0
+        config = self.config
+        levels = list(zip(self._sizes, config.down, (*config.up, 0), strict=True))
+        masked = [n > 0 and size >= _MASKED for n, size in enumerate(self._sizes)]
+        leak = config.fold
+        leak += sum(
+            size * (down + up)
+            for (size, down, up), quiet in zip(levels, masked, strict=True)
+            if not quiet
+        )
+        for n, (size, down, up) in enumerate(levels):
+            if not masked[n]:
+                continue
+            last = n + 1 == len(levels)
+            if count := down if last else up:
+                leak += size * (2 - count % 2)
+                break
+            leak += size if last else 0
         return math.ceil(leak / 2 / self.size_multiple) * self.size_multiple
 
     def needs(self, pixel: int) -> Span:

@@ -39,7 +39,7 @@ class NetworkConfig:
     up: tuple[int, ...] = (2, 2)
     fold: int = 4
     rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
-    fine_rings: tuple[int, ...] = (1, 2, 5, 12)
+    fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
     kernel: int = 3
     normal: int | None = 0
     position: int | None = 3

@@ -149,6 +149,7 @@ FAST: dict[str, Any] = {
         "down": (0, 2, 2),
         "up": (1, 2),
         "rings": (1, 1, 2, 2),
+        "fine_rings": (1, 2, 4),
     }
 }
 BEST: dict[str, Any] = {
@@ -157,6 +158,7 @@ BEST: dict[str, Any] = {
         "steps": (2, 2, 2),
         "down": (1, 2, 3, 3),
         "up": (2, 2, 3),
+        "fine_rings": (1, 1, 2, 2, 4, 4, 8, 8),
     }
 }
 
