@@ -186,7 +186,8 @@ class FoldUNet(Shader):
             cells = F.avg_pool2d(cells, step)
             here = sampled(seen, size // config.fold)
             nearness = here[:, 6:] * (1 / (here[:, 5:6] * -1).clamp_min(0.25))
-            told.append(torch.cat([here[:, :3], nearness, cells, horizons(here, config.rings)], 1))
+            around = horizons(here, config.rings, len(config.rings))
+            told.append(torch.cat([here[:, :3], nearness, cells, around], 1))
             masks.append((cells * 1e6).clamp(0, 1) if size >= _MASKED else None)
         return horizons(seen, config.fine_rings), told, masks
 
