@@ -43,6 +43,16 @@ def small(monkeypatch):
     monkeypatch.setattr(calibration, "_SIZES", ((16, 16), (32, 32)))
 
 
+def test_what_the_bundles_own_tests_found_counts_if_it_is_more(bundle):
+    """Beside itself the probe finds nothing added."""
+    for added, expected in ((0.05, 0.05), (-0.05, 0.0), (float("nan"), 0.0)):
+        tests = {"a": {str(REFERENCE): {"added": added}}, "b": {str(REFERENCE): {}}, "c": None}
+        known = replace(bundle, metrics={**bundle.metrics, "backends": tests})
+        (found,) = Calibration(None, threads=1).measure(known, [REFERENCE])
+        assert found.added == pytest.approx(expected)
+        assert found.dssim == pytest.approx(0.04 * (1 + expected))
+
+
 def test_a_measurement_is_kept_and_found_again(bundle, tmp_path):
     path = tmp_path / "cache" / "c.json"
     first = Calibration(path, threads=1)
