@@ -53,7 +53,7 @@ def horizons(cells: Tensor, rings: Sequence[int], together: int = 1) -> Tensor:
         near = ((square * inverse) * -_FADE + _GONE * _FADE).clamp(0, 1) * there[:, 3] * mask
         rise = x * normal[:, :1] + y * normal[:, 1:2] + z * normal[:, 2:]
         rise = F.relu(rise * inverse * near)
-        for index, ring in enumerate(rise.split(4, 1), first):
+        for index, ring in enumerate(torch.split(rise, 4, 1), first):
             if index < 2:
                 highest.append(ring)
             else:
