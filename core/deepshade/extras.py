@@ -10,6 +10,7 @@ EXTRAS: dict[str, tuple[tuple[str, str], ...]] = {
     "service": (
         ("fastapi", "fastapi"),
         ("uvicorn", "uvicorn"),
+        ("httptools", "httptools"),
         ("onnxruntime", "onnxruntime"),
         ("openvino", "openvino"),
         ("python_multipart", "python-multipart"),
