@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 from deepshade import exr
 from deepshade.effects import EFFECTS
-from deepshade.engines import Engine, busy
+from deepshade.engines import Engine
 from deepshade.machine import trim
+from deepshade.threads import busy
 from deepshade_service import shading
 from deepshade_service.choice import Choice, Choices
 from deepshade_service.memory import MemoryBudget

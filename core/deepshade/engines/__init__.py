@@ -12,7 +12,6 @@ Nothing heavy is imported before it is asked for.
 from deepshade.engines.base import Backend, Engine
 from deepshade.engines.registry import REFERENCE, available, known, load_engine, usable
 from deepshade.errors import EngineError
-from deepshade.threads import busy
 
 __all__ = [
     "REFERENCE",
@@ -20,7 +19,6 @@ __all__ = [
     "Engine",
     "EngineError",
     "available",
-    "busy",
     "known",
     "load_engine",
     "usable",
