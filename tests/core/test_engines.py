@@ -18,12 +18,12 @@ from deepshade.engines import (
     Backend,
     EngineError,
     available,
-    busy,
     known,
     load_engine,
     usable,
 )
 from deepshade.machine import resident
+from deepshade.threads import busy
 
 # Of the values: rounding positions of 1000 in fp32, and the unit roundoffs of the others.
 TOLERANCE = {"fp32": 2**-12, "bf16": 2**-6, "fp16": 2**-9, "int8": 2**-5}
