@@ -48,6 +48,7 @@ class Network:
         """Stack the inputs in network order, positions divided by the radius, sides padded."""
         self._shape = (view.background.shape[0], view.background.shape[1])
         self._ready = stacked(self.bundle, view)
+        self.engine.prepare(*self._ready.shape[2:])
 
     def shade(self, view: View) -> Float:
         """(H, W) of the prepared view."""

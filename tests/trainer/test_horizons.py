@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from deepshade_trainer.horizons import DIRECTIONS, horizons, sampled, unit
+from deepshade_trainer.horizons import directions, horizons, sampled, unit
 
 # Of `horizons`: right, down, left, up, then the diagonals.
 RIGHT, DOWN, LEFT, UP = range(4)
@@ -54,6 +54,18 @@ def test_the_highest_ring_counts_in_its_turn() -> None:
         0.05 / math.hypot(0.05, 0.02), abs=1e-4
     )
     assert horizons(cells, (1, 2))[0, RIGHT, 4, 4] == 0  # 2 is the diagonals' turn
+
+
+@pytest.mark.parametrize("rings", [(1,), (1, 2), (2, 1, 3), (1, 1, 2, 2, 20)])
+def test_neighbours_together_or_one_by_one(rings: tuple[int, ...]) -> None:
+    """The same to the last bit; rings may be wider than the picture."""
+    cells = ground(12)
+    cells[:, 5] += 0.05 * torch.rand(1, 12, 12, generator=torch.Generator().manual_seed(1))
+    cells[:, :, 3:5, 2:7] = 0
+    one, all_ = horizons(cells, rings), horizons(cells, rings, together=True)
+    assert one.shape[1] == directions(rings)
+    assert one.max() > 0
+    assert torch.equal(one, all_)
 
 
 @pytest.mark.parametrize(("distance", "weight"), [(0.4, 1.0), (1.6, 0.0), (100.0, 0.0)])
@@ -103,4 +115,3 @@ def test_unit_vectors() -> None:
     found = unit(vectors)
     assert torch.allclose(found[1], torch.nn.functional.normalize(vectors[1], dim=0), atol=1e-5)
     assert found[0, :, 0, 0].abs().max() == 0
-    assert horizons(ground(), (1, 1)).shape[1] == DIRECTIONS

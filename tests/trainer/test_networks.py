@@ -30,6 +30,16 @@ SMALL = NetworkConfig(
 WIDE = NetworkConfig(
     widths=(8, 12), steps=(4,), down=(0, 2), up=(1,), fold=4, rings=(1, 1), fine_rings=(1, 2, 5, 4)
 )
+DETAILED = NetworkConfig(
+    widths=(8, 12),
+    steps=(2,),
+    down=(1, 1),
+    up=(1,),
+    fold=4,
+    rings=(1,),
+    fine_rings=(1,),
+    detail=(9, 1),
+)
 SMALL_PAPER = NetworkConfig(kind="paper", widths=(4, 8, 16))
 
 
@@ -68,7 +78,7 @@ def test_the_papers_networks_have_the_published_number_of_parameters(effect: str
     assert sum(p.numel() for p in build(config).parameters()) == published
 
 
-@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE])
+@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE, DETAILED])
 def test_a_pixel_beyond_the_halo_changes_nothing(config: NetworkConfig) -> None:
     model = awake(config)
     step, halo = model.size_multiple, model.halo
@@ -86,7 +96,7 @@ def test_a_pixel_beyond_the_halo_changes_nothing(config: NetworkConfig) -> None:
     assert reach > halo // 2  # the bound isn't loose; float32 hides the faintest influence
 
 
-@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE])
+@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE, DETAILED])
 def test_needs_are_exactly_what_gradients_reach(config: NetworkConfig) -> None:
     """Weights are positive and no rectifier clips: every path counts, so the bound must be met.
 
@@ -144,7 +154,7 @@ LEAKING = [
 ]
 
 
-@pytest.mark.parametrize("config", [SMALL, WIDE, *LEAKING])
+@pytest.mark.parametrize("config", [SMALL, WIDE, DETAILED, *LEAKING])
 def test_background_beyond_its_halo_changes_nothing(config: NetworkConfig) -> None:
     model = awake(config)
     step, margin = model.size_multiple, model.background_halo

@@ -14,21 +14,22 @@ from torch.nn import functional as F
 
 from deepshade.errors import ConfigError
 
-from .horizons import DIRECTIONS, horizons, sampled, unit
+from .horizons import directions, horizons, sampled, unit
 from .networks import NetworkConfig, Shader
 from .spans import Span, folded, grown, joined
 
 # Levels whose cells are this many pixels wide keep those without geometry at zero.
 _MASKED = 16
-# What a coarse cell is told: normal, R/z, coverage, horizons.
-_TOLD = 5 + DIRECTIONS
+# What a coarse cell is told besides its horizons: normal, R/z, coverage.
+_TOLD = 5
 
 
 class FoldUNet(Shader):
     """Our network: pixels folded into channels, dense convolutions, geometry at every scale.
 
     The normals of `fold` x `fold` pixels become one cell. At every level each cell is told its
-    `horizons`: what occludes it. They are float32 arithmetic before the first convolution, so that
+    `horizons`: what occludes it; with `detail`, the finest also those of its four quarters, for
+    what is thinner than a cell. They are float32 arithmetic before the first convolution, so that
     engines can run the convolutions in 16 or 8 bits while no large position ever matters to one.
 
     Nothing has a bias where there is no geometry, and coarse cells without geometry are kept at
@@ -51,15 +52,24 @@ class FoldUNet(Shader):
                 detail="down needs an entry for each of the widths, up and steps one fewer",
             )
         for name in ("rings", "fine_rings"):
-            if len(rings := getattr(config, name)) < 2 or min(rings) < 1:
-                raise ConfigError(name, detail=f"{name} needs two distances, of 1 cell or more")
+            if not (rings := getattr(config, name)) or min(rings) < 1:
+                raise ConfigError(name, detail=f"{name} are distances of 1 cell or more")
+        if config.detail and (min(config.detail) < 1 or config.fold % 2):
+            raise ConfigError(
+                "detail", detail="detail are distances of 1 half cell or more, of an even fold"
+            )
         place = config.position
         # Raw positions are too large for a convolution in 16 bits; everything else is welcome.
         self.raw = [k for k in range(config.inputs) if not place <= k < place + 3]
         self.door = nn.Conv2d(len(self.raw), widths[0], config.fold, stride=config.fold, bias=False)
         pairs = list(zip(itertools.pairwise(widths), config.steps, strict=True))
-        self.horizon = nn.Conv2d(DIRECTIONS, widths[0], 1, bias=False)
-        self.tell = nn.ModuleList(nn.Conv2d(_TOLD, width, 1, bias=False) for width in widths[1:])
+        self.horizon = nn.Conv2d(directions(config.fine_rings), widths[0], 1, bias=False)
+        quarters = directions(config.detail)
+        self.detail = (
+            nn.Conv2d(quarters, widths[0], 2, stride=2, bias=False) if config.detail else None
+        )
+        told = _TOLD + directions(config.rings)
+        self.tell = nn.ModuleList(nn.Conv2d(told, width, 1, bias=False) for width in widths[1:])
         self.encode = nn.ModuleList(map(_stack, widths, config.down))
         self.shrink = nn.ModuleList(
             nn.Conv2d(fine, coarse, step, stride=step, bias=False) for (fine, coarse), step in pairs
@@ -127,6 +137,9 @@ class FoldUNet(Shader):
             size = self._sizes[n]
             first, last = grown(span, max(config.rings if n else config.fine_rings))
             pixels = joined(pixels, (self._sampled_at(first, size), self._sampled_at(last, size)))
+        if config.detail:
+            half = grown(folded(span, 2), max(config.detail))
+            pixels = joined(pixels, (half[0] * config.fold // 2, half[1] * config.fold // 2))
         return joined(pixels, folded(span, config.fold))
 
     def _sampled_at(self, cell: int, size: int) -> int:
@@ -137,7 +150,7 @@ class FoldUNet(Shader):
     def forward(self, gbuffer: Tensor) -> Tensor:
         """See `Shader.forward`."""
         with _full_precision():
-            near, told, masks = self.features(gbuffer)
+            near, nearest, told, masks = self.features(gbuffer)
         place, weight = self.config.position or 0, self.door.weight
         if place + 3 == gbuffer.shape[1]:
             # All that is raw comes first. An odd number of channels would be slower in 16 bits.
@@ -146,7 +159,10 @@ class FoldUNet(Shader):
         else:
             raw = torch.cat([gbuffer[:, :place], gbuffer[:, place + 3 :]], 1)
         x = F.conv2d(raw, weight, stride=self.config.fold)
-        x = F.relu(x + self.horizon(near))
+        x = x + self.horizon(near)
+        if self.detail is not None:
+            x = x + self.detail(nearest)
+        x = F.relu(x)
         skips = []
         for n, stack in enumerate(self.encode):
             if n:
@@ -162,14 +178,17 @@ class FoldUNet(Shader):
             if not self.training:
                 image = image.clamp(0, 1)
             image = F.pixel_shuffle(image, self.config.fold)
-            covered = _covered(gbuffer[:, place : place + 3])
+            covered = _covered(gbuffer[:, place + 2 : place + 3])
             return (image - self.background) * covered + self.background
 
-    def features(self, gbuffer: Tensor) -> tuple[Tensor, list[Tensor], list[Tensor | None]]:
+    def features(
+        self, gbuffer: Tensor
+    ) -> tuple[Tensor, Tensor | None, list[Tensor], list[Tensor | None]]:
         """What the positions of a G-buffer (N, inputs, H, W) tell, all in float32.
 
-        Returns the first level's horizons (N, 8, h, w); for each level but the first what its cells
-        are told (N, 13, ...); and for each level its mask of cells with geometry, or None.
+        Returns the first level's horizons (N, 8, h, w); those of its cells' quarters
+        (N, 8, 2h, 2w), or None without `detail`; for each level but the first what its cells are
+        told (N, 13, ...); and for each level its mask of cells with geometry, or None.
         """
         config = self.config
         start, place = config.normal or 0, config.position or 0
@@ -177,8 +196,14 @@ class FoldUNet(Shader):
         if (start, place, gbuffer.shape[1]) != (0, 3, 6):
             six = torch.cat([gbuffer[:, start : start + 3], gbuffer[:, place : place + 3]], 1)
         # One pixel stands for its cell. A mean would lie in the air where a cell shows an edge.
-        seen = sampled(six, config.fold)
-        seen = torch.cat([unit(seen[:, :3]), seen[:, 3:], _covered(seen[:, 3:])], 1)
+        nearest = None
+        if config.detail:
+            half = config.fold // 2
+            quarters = _seen(six[:, :, ::half, ::half])
+            nearest = horizons(quarters, config.detail)
+            seen = quarters[:, :, 1::2, 1::2]
+        else:
+            seen = _seen(sampled(six, config.fold))
         cells = seen[:, 6:]
         told: list[Tensor] = []
         masks: list[Tensor | None] = [None]
@@ -186,15 +211,21 @@ class FoldUNet(Shader):
             cells = F.avg_pool2d(cells, step)
             here = sampled(seen, size // config.fold)
             nearness = here[:, 6:] * (1 / (here[:, 5:6] * -1).clamp_min(0.25))
-            around = horizons(here, config.rings, len(config.rings))
+            around = horizons(here, config.rings, together=True)
             told.append(torch.cat([here[:, :3], nearness, cells, around], 1))
             masks.append((cells * 1e6).clamp(0, 1) if size >= _MASKED else None)
-        return horizons(seen, config.fine_rings), told, masks
+        return horizons(seen, config.fine_rings), nearest, told, masks
 
 
-def _covered(position: Tensor) -> Tensor:
-    """(N, 1, h, w): 1 where there is geometry; nearer than 1e-4 radii nothing can be."""
-    return (position[:, 2:3] * -1e4).clamp(0, 1)
+def _seen(six: Tensor) -> Tensor:
+    """Normals and positions (N, 6, h, w) as `horizons` takes them: (N, 7, h, w)."""
+    normal, position = torch.split(six, 3, 1)
+    return torch.cat([unit(normal), position, _covered(position[:, 2:])], 1)
+
+
+def _covered(z: Tensor) -> Tensor:
+    """1 where there is geometry, of the same shape; nearer than 1e-4 radii nothing can be."""
+    return (z * -1e4).clamp(0, 1)
 
 
 class Stack(nn.ModuleList):

@@ -9,6 +9,7 @@ integral, and only needs to be told the horizons, at a few distances and far few
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -19,51 +20,64 @@ _TURNS = (
     ((0, 1), (1, 0), (0, -1), (-1, 0)),
     ((1, 1), (1, -1), (-1, -1), (-1, 1)),
 )
-DIRECTIONS = 8
 # Points count in full up to about half a radius, and not at all from _GONE radii on: as the sweep
 # of our own horizon-based rivals found best.
 _GONE, _FADE = 1.6, 0.9
+_AWAY = 1e4  # effect radii
 
 
-def horizons(cells: Tensor, rings: Sequence[int], together: int = 1) -> Tensor:
+def directions(rings: Sequence[int]) -> int:
+    """In how many directions these rings are looked at: the axes, and with a second ring all 8."""
+    return 4 * min(2, len(rings))
+
+
+def horizons(cells: Tensor, rings: Sequence[int], together: bool = False) -> Tensor:
     """The highest of the points that lie `rings` cells away, for each cell and direction.
 
     The first ring is looked at along the axes, the second along the diagonals, and so by turns.
     `cells` (N, 7, h, w) are unit normals, positions in effect radii, and 1 where there is geometry.
-    Returns (N, 8, h, w) in [0, 1]: the sine of the angle at which a point rises above the cell's
-    tangent plane, faded out towards 1.6 radii; 0 where nothing rises. `together` rings are
-    calculated at a time, which changes nothing but speed: engines are quicker with few large
-    tensors, up to what their caches hold.
+    Returns (N, `directions`, h, w) in [0, 1]: the sine of the angle at which a point rises above
+    the cell's tangent plane, faded out towards 1.6 radii; 0 where nothing rises. `together` changes
+    nothing but speed: engines are quicker with one neighbour at a time where there are many cells,
+    and with all of them at once where there are few.
     """
-    normal, here, mask = cells[:, :3], cells[:, 3:7], cells[:, 6:]
-    height, width = here.shape[2:]
+    normals, across, depth, covered = torch.split(cells, [3, 2, 1, 1], 1)
+    normal = torch.split(normals, 1, 1)
+    # Nothing is near what is far behind the camera: neither background nor the picture's edge.
+    here = torch.cat([across, depth + (covered * -_AWAY + _AWAY)], 1)
     margin = max(rings)
-    wide = F.pad(here, (margin, margin, margin, margin))
-    highest: list[Tensor] = []
-    for first in range(0, len(rings), together):
-        corners = [
-            (margin + ring * down, margin + ring * right)
-            for index, ring in enumerate(rings[first : first + together], first)
-            for down, right in _TURNS[index % 2]
-        ]
-        there = torch.stack([wide[:, :, y : y + height, x : x + width] for y, x in corners], 2)
-        x, y, z = (there[:, k] + here[:, k : k + 1] * -1 for k in range(3))
+    wide = F.pad(here, (margin, margin, margin, margin), value=_AWAY)
+    neighbours = [
+        _cut(wide, margin, ring * down, ring * right)
+        for index, ring in enumerate(rings)
+        for down, right in _TURNS[index % 2]
+    ]
+    found: list[Tensor] = []
+    for there in [torch.stack(neighbours, 2)] if together else neighbours:
+        x, y, z = (
+            (theirs.squeeze(1) if together else theirs) + ours * -1
+            for theirs, ours in zip(torch.split(there, 1, 1), torch.split(here, 1, 1), strict=True)
+        )
         square = (x * x + y * y + z * z).clamp(1e-6, 4)  # beyond, all has faded anyway
         inverse = torch.rsqrt(square)
-        near = ((square * inverse) * -_FADE + _GONE * _FADE).clamp(0, 1) * there[:, 3] * mask
-        rise = x * normal[:, :1] + y * normal[:, 1:2] + z * normal[:, 2:]
-        rise = F.relu(rise * inverse * near)
-        for index, ring in enumerate(torch.split(rise, 4, 1), first):
-            if index < 2:
-                highest.append(ring)
-            else:
-                highest[index % 2] = torch.maximum(highest[index % 2], ring)
-    return torch.cat(highest, 1)
+        near = ((square * inverse) * -_FADE + _GONE * _FADE).clamp(0, 1)
+        rise = x * normal[0] + y * normal[1] + z * normal[2]
+        found.append(F.relu(rise * inverse * near))
+    if together:
+        found = list(torch.split(found[0], 4, 1))
+    turn = directions(rings) // (4 if together else 1)
+    return torch.cat([reduce(torch.maximum, found[k::turn]) for k in range(turn)], 1)
+
+
+def _cut(wide: Tensor, margin: int, down: int, right: int) -> Tensor:
+    """`wide` without its margin, moved: one operation, where slicing would be two."""
+    return F.pad(wide, (-margin - right, right - margin, -margin - down, down - margin))
 
 
 def unit(vectors: Tensor) -> Tensor:
     """(N, 3, h, w) scaled to length 1; zeros stay zeros."""
-    return vectors * torch.rsqrt(vectors.square().sum(1, keepdim=True) + 1e-12)
+    x, y, z = torch.split(vectors, 1, 1)
+    return vectors * torch.rsqrt(x * x + y * y + z * z + 1e-12)
 
 
 def sampled(x: Tensor, size: int) -> Tensor:

@@ -26,8 +26,8 @@ class NetworkConfig:
     has convolutions of `kernel` x `kernel`. Ours folds `fold` x `fold` pixels into channels, its
     levels are `steps` times coarser than the one before, and have `down` convolutions of 3 x 3 on
     the way down and `up` on the way up. Every level is told its `horizons`, found `rings` cells
-    away, the first `fine_rings`. `normal` and `position` are the first of their three input
-    channels, None without them.
+    away, the first `fine_rings`, and those of cells of half a fold, `detail` of these away, if any.
+    `normal` and `position` are the first of their three input channels, None without them.
     """
 
     kind: str = "fold"
@@ -40,6 +40,7 @@ class NetworkConfig:
     fold: int = 4
     rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
     fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
+    detail: tuple[int, ...] = ()
     kernel: int = 3
     normal: int | None = 0
     position: int | None = 3

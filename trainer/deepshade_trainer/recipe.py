@@ -33,7 +33,8 @@ def check_types(settings: Any) -> None:
         wanted = (int, float) if isinstance(default, float) else type(default)
         good = isinstance(value, wanted) and not isinstance(value, bool)
         if isinstance(value, tuple):
-            good = good and len(value) > 0 and all(type(v) is int and v >= 0 for v in value)
+            good = good and all(type(v) is int and v >= 0 for v in value)
+            good = good and (len(value) > 0 or not default)
         if not good:
             raise ConfigError(
                 field_.name, detail=f"{field_.name} can't be {value!r}, it is like {default!r}"

@@ -46,6 +46,7 @@ _FIRST_WIDTHS = (16, 24, 32, 48, 64, 96)
 _WIDTH_GROWTHS = (1.0, 1.25, 1.5, 2.0)
 _MOST_WIDTH = 256
 _RINGS = ((1, 2), (1, 1, 2, 2), (1, 2, 4, 8), (1, 2, 5, 12), (1, 1, 2, 2, 4, 4))
+_DETAILS = ((), (), (1,), (1, 1))
 
 
 @dataclass(frozen=True)
@@ -240,6 +241,7 @@ def _drawn(like: NetworkConfig, rng: np.random.Generator) -> NetworkConfig:
         up=tuple(int(rng.integers(0, 4)) for _ in steps),
         rings=_RINGS[rng.integers(len(_RINGS))],
         fine_rings=_RINGS[rng.integers(len(_RINGS))],
+        detail=_DETAILS[rng.integers(len(_DETAILS))],
     )
 
 
@@ -257,6 +259,7 @@ def _changed(old: NetworkConfig, rng: np.random.Generator) -> NetworkConfig:
         {"up": tuple(up)},
         {"fold": other.fold},
         {"rings": other.rings, "fine_rings": other.fine_rings},
+        {"detail": other.detail},
     ]
     if len(other.steps) == len(old.steps):
         options.append({"steps": other.steps})
@@ -282,8 +285,7 @@ def _parse(line: str) -> Trial:
 
 def label(network: NetworkConfig) -> str:
     """A network in one word, which may name a file."""
-    lists = (network.widths, network.steps, network.down, network.up)
-    widths, steps, down, up, rings, fine = (
-        "-".join(map(str, values)) for values in (*lists, network.rings, network.fine_rings)
-    )
-    return f"f{network.fold}w{widths}s{steps}d{down}u{up}r{rings}n{fine}"
+    n = network
+    lists = (n.widths, n.steps, n.down, n.up, n.rings, n.fine_rings, n.detail)
+    named = ("-".join(map(str, values)) for values in lists)
+    return f"f{n.fold}" + "".join(map("".join, zip("wsdurnq", named, strict=True)))
