@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 import threading
+import weakref
 
 import numpy as np
 import onnx
@@ -22,7 +24,7 @@ from deepshade.engines import (
     load_engine,
     usable,
 )
-from deepshade.machine import resident
+from deepshade.machine import resident, trim
 from deepshade.threads import busy
 
 # Of the values: rounding positions of 1000 in fp32, and the unit roundoffs of the others.
@@ -282,6 +284,31 @@ def test_a_size_that_comes_often_is_compiled_aside(slopes):
     for height in range(4, 200, 4):
         engine.predict(far_away(height, 4))
     assert len(compiled) == 1
+
+
+@pytest.mark.parametrize("backend", HERE, ids=str)
+def test_a_picture_is_not_kept(slopes, backend):
+    """A service's idle engine must not hold on to the last picture's 1.6 GB."""
+    engine = load_engine(slopes, backend, threads=1)
+    for _ in range(2):
+        gbuffer = far_away()
+        gone = weakref.ref(gbuffer)
+        engine.predict(gbuffer)
+        del gbuffer
+        gc.collect()
+        assert gone() is None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(Backend("openvino", "fp32") not in HERE, reason="OpenVINO isn't installed")
+def test_a_large_size_that_is_compiled_keeps_no_memory(slopes):
+    engine = load_engine(slopes, Backend("openvino", "fp32"), threads=1)
+    engine.prepare(64, 64)
+    trim()
+    before = resident()
+    engine.prepare(2048, 2048)
+    trim()
+    assert resident() - before < 24 * 2**20  # a channel of it is 16 MiB
 
 
 @pytest.mark.slow

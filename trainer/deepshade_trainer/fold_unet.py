@@ -68,6 +68,8 @@ class FoldUNet(Shader):
         self.detail = (
             nn.Conv2d(quarters, widths[0], 2, stride=2, bias=False) if config.detail else None
         )
+        if self.detail is not None:
+            nn.init.normal_(self.detail.weight, std=0.01)  # what isn't, may join later
         told = _TOLD + directions(config.rings)
         self.tell = nn.ModuleList(nn.Conv2d(told, width, 1, bias=False) for width in widths[1:])
         self.encode = nn.ModuleList(map(_stack, widths, config.down))

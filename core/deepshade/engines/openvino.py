@@ -18,6 +18,7 @@ Three things here are measured rather than obvious:
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -39,6 +40,10 @@ _CAPABILITIES = {"fp32": "FP32", "bf16": "BF16", "fp16": "FP16", "int8": "INT8"}
 _OFTEN = 4
 _SIZES = 12
 _LIVE_PIXELS = 4 * 2**20
+# Compiling takes as much memory as a prediction. For sizes above so many pixels it waits until
+# nothing has run for `_QUIET` seconds, but no longer than `_PATIENCE`.
+_LARGE = 2**20
+_QUIET, _PATIENCE = 0.1, 5.0
 
 Shape = tuple[int, ...]
 
@@ -74,6 +79,8 @@ class OpenVino(Engine):
         self._fixed: OrderedDict[tuple[Shape, int], _Network] = OrderedDict()
         self._seen: OrderedDict[tuple[Shape, int], int] = OrderedDict()  # how often
         self._pending: dict[tuple[Shape, int], Future[None]] = {}
+        self._running = 0
+        self._ended = 0.0  # when the last prediction did
         self._network(None, threads)
 
     def prepare(self, height: int, width: int) -> None:
@@ -98,14 +105,30 @@ class OpenVino(Engine):
             else:
                 self._seen[key] = self._seen.pop(key, 0) + 1
                 if self._seen[key] >= _OFTEN and key not in self._pending:
-                    self._pending[key] = _background.submit(self._fix, key)
+                    self._pending[key] = _background.submit(self._fix_later, key)
                 if len(self._seen) > 64:
                     self._seen.popitem(last=False)
-        if network is None:
-            network = self._network(None, threads)
-        shade = network.run(gbuffer)
+            self._running += 1
+        try:
+            if network is None:
+                network = self._network(None, threads)
+            shade = network.run(gbuffer)
+        finally:
+            with self._lock:
+                self._running -= 1
+                self._ended = time.monotonic()
         self._bound(network)
         return shade
+
+    def _fix_later(self, key: tuple[Shape, int]) -> None:
+        """`_fix`, for a large size when nothing runs."""
+        *_, height, width = key[0]
+        latest = time.monotonic() + (_PATIENCE if height * width > _LARGE else 0)
+        while time.monotonic() < latest:
+            if not self._running and time.monotonic() - self._ended > _QUIET:
+                break
+            time.sleep(_QUIET / 2)
+        self._fix(key)
 
     def _fix(self, key: tuple[Shape, int]) -> None:
         """Compile a size. One that fails stays on the free graph, and isn't tried again."""
@@ -114,6 +137,10 @@ class OpenVino(Engine):
             if key in self._fixed:
                 return
         network = self._compile(shape, threads)
+        if shape[2] * shape[3] > _LARGE:
+            # The plugin has already taken what a prediction needs, and can't give it back before.
+            network.run(np.zeros(shape, np.float32))
+            network.release()
         with self._lock:
             self._fixed[key] = network
             if len(self._fixed) > _SIZES:
