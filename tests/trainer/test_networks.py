@@ -26,6 +26,7 @@ SMALL = NetworkConfig(
     fold=2,
     rings=(1, 2),
     fine_rings=(1, 1, 3),
+    detail=(),
 )
 WIDE = NetworkConfig(
     widths=(8, 12), steps=(4,), down=(0, 2), up=(1,), fold=4, rings=(1, 1), fine_rings=(1, 2, 5, 4)

@@ -56,7 +56,7 @@ class FoldUNet(Shader):
                 raise ConfigError(name, detail=f"{name} are distances of 1 cell or more")
         if config.detail and (min(config.detail) < 1 or config.fold % 2):
             raise ConfigError(
-                "detail", detail="detail are distances of 1 half cell or more, of an even fold"
+                "detail", detail="detail are distances of 1 quarter or more, and need an even fold"
             )
         place = config.position
         # Raw positions are too large for a convolution in 16 bits; everything else is welcome.

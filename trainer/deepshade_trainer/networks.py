@@ -26,8 +26,9 @@ class NetworkConfig:
     has convolutions of `kernel` x `kernel`. Ours folds `fold` x `fold` pixels into channels, its
     levels are `steps` times coarser than the one before, and have `down` convolutions of 3 x 3 on
     the way down and `up` on the way up. Every level is told its `horizons`, found `rings` cells
-    away, the first `fine_rings`, and those of cells of half a fold, `detail` of these away, if any.
-    `normal` and `position` are the first of their three input channels, None without them.
+    away, the first `fine_rings`, and also those of its cells' quarters, `detail` quarters away,
+    unless that is empty. `normal` and `position` are the first of their three input channels, None
+    without them.
     """
 
     kind: str = "fold"
@@ -40,7 +41,7 @@ class NetworkConfig:
     fold: int = 4
     rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
     fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
-    detail: tuple[int, ...] = ()
+    detail: tuple[int, ...] = (1, 1)
     kernel: int = 3
     normal: int | None = 0
     position: int | None = 3

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from deepshade.errors import ConfigError
+
 from .networks import NetworkConfig, Shader
 from .spans import Span, through_u
 
@@ -15,6 +17,8 @@ class PaperUNet(Shader):
 
     def __init__(self, config: NetworkConfig, background: float) -> None:
         super().__init__(config, background)
+        if not config.widths:
+            raise ConfigError("widths", detail="the paper's network needs at least one width")
         widths, k = config.widths, config.kernel
         before = (config.inputs, *widths[:-1])
         self.down = nn.ModuleList(

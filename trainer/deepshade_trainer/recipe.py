@@ -34,7 +34,6 @@ def check_types(settings: Any) -> None:
         good = isinstance(value, wanted) and not isinstance(value, bool)
         if isinstance(value, tuple):
             good = good and all(type(v) is int and v >= 0 for v in value)
-            good = good and (len(value) > 0 or not default)
         if not good:
             raise ConfigError(
                 field_.name, detail=f"{field_.name} can't be {value!r}, it is like {default!r}"
@@ -151,6 +150,7 @@ FAST: dict[str, Any] = {
         "up": (1, 2),
         "rings": (1, 1, 2, 2),
         "fine_rings": (1, 2, 4),
+        "detail": (),
     }
 }
 BEST: dict[str, Any] = {
