@@ -200,10 +200,9 @@ class FoldUNet(Shader):
         # One pixel stands for its cell. A mean would lie in the air where a cell shows an edge.
         nearest = None
         if config.detail:
-            half = config.fold // 2
-            quarters = _seen(six[:, :, ::half, ::half])
+            quarters = _seen(sampled(six, config.fold // 2, 0))
             nearest = horizons(quarters, config.detail)
-            seen = quarters[:, :, 1::2, 1::2]
+            seen = sampled(quarters, 2)
         else:
             seen = _seen(sampled(six, config.fold))
         cells = seen[:, 6:]

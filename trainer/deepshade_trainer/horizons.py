@@ -80,6 +80,14 @@ def unit(vectors: Tensor) -> Tensor:
     return vectors * torch.rsqrt(x * x + y * y + z * z + 1e-12)
 
 
-def sampled(x: Tensor, size: int) -> Tensor:
-    """(N, C, H/size, W/size): the middle pixel of each block of `size` x `size`."""
-    return x[:, :, size // 2 :: size, size // 2 :: size]
+def sampled(x: Tensor, size: int, pixel: int | None = None) -> Tensor:
+    """(N, C, H/size, W/size): one pixel of each block of `size` x `size`.
+
+    The one in this row and column of the block; by default the middle one.
+    """
+    pixel = size // 2 if pixel is None else pixel
+    count, channels, height, width = x.shape
+    # Engines are quicker to copy whole rows, and then pick from these, than to pick at once.
+    rows = x.reshape(count, channels, height // size, size * width)
+    rows = rows[..., pixel * width : (pixel + 1) * width]
+    return rows.reshape(count, channels, height // size, width // size, size)[..., pixel]
