@@ -64,12 +64,11 @@ class FoldUNet(Shader):
         self.door = nn.Conv2d(len(self.raw), widths[0], config.fold, stride=config.fold, bias=False)
         pairs = list(zip(itertools.pairwise(widths), config.steps, strict=True))
         self.horizon = nn.Conv2d(directions(config.fine_rings), widths[0], 1, bias=False)
-        quarters = directions(config.detail)
-        self.detail = (
-            nn.Conv2d(quarters, widths[0], 2, stride=2, bias=False) if config.detail else None
-        )
-        if self.detail is not None:
-            nn.init.normal_(self.detail.weight, std=0.01)  # what isn't, may join later
+        self.detail: nn.Conv2d | None = None
+        if config.detail:
+            self.detail = nn.Conv2d(directions(config.detail), widths[0], 2, stride=2, bias=False)
+            # small, so that a network trained without it can go on with it
+            nn.init.normal_(self.detail.weight, std=0.01)
         told = _TOLD + directions(config.rings)
         self.tell = nn.ModuleList(nn.Conv2d(told, width, 1, bias=False) for width in widths[1:])
         self.encode = nn.ModuleList(map(_stack, widths, config.down))
@@ -188,9 +187,9 @@ class FoldUNet(Shader):
     ) -> tuple[Tensor, Tensor | None, list[Tensor], list[Tensor | None]]:
         """What the positions of a G-buffer (N, inputs, H, W) tell, all in float32.
 
-        Returns the first level's horizons (N, 8, h, w); those of its cells' quarters
-        (N, 8, 2h, 2w), or None without `detail`; for each level but the first what its cells are
-        told (N, 13, ...); and for each level its mask of cells with geometry, or None.
+        Returns the first level's horizons (N, `directions`, h, w); those of its cells' quarters
+        (N, `directions`, 2h, 2w), or None without `detail`; for each level but the first what its
+        cells are told; and for each level its mask of cells with geometry, or None.
         """
         config = self.config
         start, place = config.normal or 0, config.position or 0

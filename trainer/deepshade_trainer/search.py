@@ -286,6 +286,13 @@ def _parse(line: str) -> Trial:
 def label(network: NetworkConfig) -> str:
     """A network in one word, which may name a file."""
     n = network
-    lists = (n.widths, n.steps, n.down, n.up, n.rings, n.fine_rings, n.detail)
-    named = ("-".join(map(str, values)) for values in lists)
-    return f"f{n.fold}" + "".join(map("".join, zip("wsdurnq", named, strict=True)))
+    lists = {
+        "w": n.widths,
+        "s": n.steps,
+        "d": n.down,
+        "u": n.up,
+        "r": n.rings,
+        "n": n.fine_rings,
+        "q": n.detail,
+    }
+    return f"f{n.fold}" + "".join(k + "-".join(map(str, v)) for k, v in lists.items())

@@ -122,8 +122,7 @@ class OpenVino(Engine):
 
     def _fix_later(self, key: tuple[Shape, int]) -> None:
         """`_fix`, for a large size when nothing runs."""
-        *_, height, width = key[0]
-        latest = time.monotonic() + (_PATIENCE if height * width > _LARGE else 0)
+        latest = time.monotonic() + (_PATIENCE if _large(key[0]) else 0)
         while time.monotonic() < latest:
             if not self._running and time.monotonic() - self._ended > _QUIET:
                 break
@@ -137,7 +136,7 @@ class OpenVino(Engine):
             if key in self._fixed:
                 return
         network = self._compile(shape, threads)
-        if shape[2] * shape[3] > _LARGE:
+        if _large(shape):
             # The plugin has already taken what a prediction needs, and can't give it back before.
             network.run(np.zeros(shape, np.float32))
             network.release()
@@ -250,6 +249,10 @@ class _Network:
         yield requests
         with self._lock:
             self._idle.append(requests)
+
+
+def _large(shape: Shape) -> bool:
+    return shape[2] * shape[3] > _LARGE
 
 
 # One at a time, so that compiling never takes more than one core from what is being shaded.
