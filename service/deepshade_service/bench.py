@@ -88,10 +88,9 @@ def bench(
 def _measure(bundle: Bundle, results: Calibration, anew: bool, noise: Any) -> None:
     from deepshade.engines import usable
 
-    for backend in usable(bundle) if anew else results.missing(bundle):
-        text = f"measuring {bundle.effect}/{bundle.name} on {backend}"
-        with noise.status(text) if noise.is_terminal else nullcontext():
-            results.measure(bundle, [backend])
+    text = f"measuring {bundle.effect}/{bundle.name} on every engine and precision"
+    with noise.status(text) if noise.is_terminal else nullcontext():
+        results.measure(bundle, usable(bundle) if anew else results.missing(bundle))
 
 
 def _rows(bundle: Bundle, results: Calibration) -> list[dict[str, Any]]:

@@ -13,7 +13,8 @@ from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS, Effect
 from deepshade.engines import Backend, Engine, load_engine, usable
 from deepshade.errors import EngineError, nearest
-from deepshade_service.calibration import Calibration, Measurement, published
+from deepshade_service.calibration import Calibration
+from deepshade_service.measurement import Measurement, published
 from deepshade_service.problems import Problem
 
 log = logging.getLogger("deepshade.service")

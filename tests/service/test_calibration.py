@@ -14,8 +14,9 @@ from deepshade import metrics
 from deepshade.bundles import Bundle, write_config
 from deepshade.engines import REFERENCE, Backend, EngineError, usable
 from deepshade.probe import write_probe
-from deepshade_service import calibration
-from deepshade_service.calibration import Calibration, Measurement, chosen_path, published
+from deepshade_service import measurement
+from deepshade_service.calibration import Calibration, chosen_path
+from deepshade_service.measurement import Measurement, published
 from deepshade_service.models import Models, fastest
 
 BF16, INT8 = Backend("openvino", "bf16"), Backend("openvino", "int8")
@@ -40,7 +41,7 @@ def bundle(tmp_path, make_bundle) -> Bundle:
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr(calibration, "_SIZES", ((16, 16), (32, 32)))
+    monkeypatch.setattr(measurement, "_SIZES", ((16, 16), (32, 32)))
 
 
 def test_what_the_bundles_own_tests_found_counts_if_it_is_more(bundle):
@@ -71,8 +72,8 @@ def test_a_measurement_is_kept_and_found_again(bundle, tmp_path):
 
 def test_what_a_precision_adds_is_measured_on_the_probe(bundle, tmp_path, monkeypatch):
     """An engine that answers too dark by a third: its error by hand, relative to fp32's."""
-    exact = calibration.load_engine(bundle, REFERENCE, threads=1)
-    windows = calibration.probe.read_probe(bundle)
+    exact = measurement.load_engine(bundle, REFERENCE, threads=1)
+    windows = measurement.probe.read_probe(bundle)
 
     class Dark:
         backend, channels = BF16, 6
@@ -86,11 +87,14 @@ def test_what_a_precision_adds_is_measured_on_the_probe(bundle, tmp_path, monkey
         def prepare(self, height, width):
             pass
 
+        def shrink(self):
+            pass
+
         def predict(self, gbuffer):
             return exact.predict(gbuffer) * np.float32(2 / 3)
 
     monkeypatch.setattr(
-        calibration,
+        measurement,
         "load_engine",
         lambda b, backend, threads: exact if backend == REFERENCE else Dark(),
     )
@@ -102,6 +106,48 @@ def test_what_a_precision_adds_is_measured_on_the_probe(bundle, tmp_path, monkey
     plain, dark = (np.mean(column) for column in errors)
     assert found.added == pytest.approx(dark / plain - 1, rel=1e-5)
     assert found.dssim == pytest.approx(0.04 * dark / plain, rel=1e-5)
+
+
+def test_a_burst_of_other_work_decides_nothing(bundle, monkeypatch):
+    """On a clock of its own, with one slow pass of each backend: the true costs are found."""
+    now = [0.0]
+    exact = measurement.load_engine(bundle, REFERENCE, threads=1)
+
+    class Clocked:
+        """Its memory is given back before the first pass and after each."""
+
+        channels = 6
+
+        def __init__(self, backend, seconds, slow):
+            self.backend, self.bundle = backend, bundle
+            self.seconds, self.slow, self.turn = seconds, slow, -1
+
+        def warm(self):
+            pass
+
+        def prepare(self, height, width):
+            pass
+
+        def predict(self, gbuffer):
+            pixels = gbuffer.shape[2] * gbuffer.shape[3]
+            now[0] += self.seconds * pixels * (10 if self.turn == self.slow else 1)
+            return exact.predict(gbuffer)
+
+        def shrink(self):
+            self.turn += 1
+
+    costs = {REFERENCE: (5e-6, 2), BF16: (2e-6, 0), INT8: (3e-6, 1)}
+    monkeypatch.setattr(
+        measurement,
+        "load_engine",
+        lambda b, backend, threads: Clocked(backend, *costs[backend]),
+    )
+    monkeypatch.setattr(measurement.time, "perf_counter", lambda: now[0])
+    found = Calibration(None, threads=1).measure(bundle, costs)
+    assert {one.backend: one.ms(10**6) for one in found} == pytest.approx(
+        {backend: 1e9 * seconds for backend, (seconds, _) in costs.items()}
+    )
+    assert fastest(found) == BF16
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"x": 3}', "\ufeff{}"])
@@ -131,14 +177,14 @@ def test_a_file_that_cannot_be_written_is_no_failure(bundle, tmp_path):
 
 
 def test_a_backend_that_fails_is_left_out(bundle, tmp_path, monkeypatch):
-    load = calibration.load_engine
+    load = measurement.load_engine
 
     def refusing(bundle, backend, *, threads):
         if backend != REFERENCE:
             raise EngineError("this one is broken")
         return load(bundle, backend, threads=threads)
 
-    monkeypatch.setattr(calibration, "load_engine", refusing)
+    monkeypatch.setattr(measurement, "load_engine", refusing)
     models = Models(tmp_path / "models", threads=1, calibration=tmp_path / "c.json")
     models.load()
     assert models.calibrating

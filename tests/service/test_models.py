@@ -10,8 +10,9 @@ import pytest
 
 from deepshade.cli import main
 from deepshade.engines import REFERENCE, Backend, usable
-from deepshade_service import calibration
+from deepshade_service import calibration, measurement
 from deepshade_service import models as models_module
+from deepshade_service.measurement import Measurement
 from deepshade_service.models import Models
 from deepshade_service.problems import Problem
 
@@ -75,11 +76,13 @@ def test_after_calibration_the_fastest_is_the_default(root, tmp_path, monkeypatc
     backends = usable(_loaded(root).bundles("ao")[0])
     chosen = [backend for backend in backends if backend.precision == "fp32"][-1]
 
-    def measured(engine, windows, base, cancelled):
-        ms = 1.0 if engine.backend == chosen else 5.0
-        return calibration.Measurement(engine.backend, 0.0, ms, None, None)
+    def measured(bundle, backends, *, threads, cancelled):
+        return {
+            backend: Measurement(backend, 0.0, 1.0 if backend == chosen else 5.0, None, None)
+            for backend in backends
+        }
 
-    monkeypatch.setattr(calibration, "_measure", measured)
+    monkeypatch.setattr(calibration, "measure", measured)
     path = tmp_path / "c.json"
     models = Models(root, threads=1, calibration=path)
     models.load()
@@ -116,8 +119,8 @@ def test_pinned_engines_are_loaded_once_and_bounded(plain, monkeypatch):
 
 @pytest.mark.slow
 def test_bench_as_json_and_as_a_table(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(calibration, "_SIZES", ((16, 16), (32, 32)))
-    monkeypatch.setattr(calibration, "_RUNS", 2)
+    monkeypatch.setattr(measurement, "_SIZES", ((16, 16), (32, 32)))
+    monkeypatch.setattr(measurement, "_RUNS", 2)
     path = tmp_path / "kept" / "c.json"
     command = ["bench", "ao", "--models", str(root), "--bundle", "worse", "--threads", "1"]
     command += ["--calibration", str(path)]
