@@ -85,11 +85,34 @@ def _malloc_trim() -> Any:
 
 def describe() -> str:
     """The processor and how many CPUs we may use of it, for benchmarks and model cards."""
-    model = platform.processor() or platform.machine()
+    model = _cpuinfo("model name") or platform.processor() or platform.machine()
+    return f"{model}, {cpu_count()} CPUs"
+
+
+@cache
+def cpu_flags() -> frozenset[str]:
+    """The instruction sets of the CPU, as Linux calls them; empty where it doesn't say."""
+    return frozenset((_cpuinfo("flags") or _cpuinfo("Features")).split())
+
+
+def cpu_kind() -> str:
+    """What the CPU multiplies 8 bits with: "amx", "vnni", or neither: its architecture.
+
+    Libraries have kernels for each, so a precision's error on one kind says little of another.
+    """
+    flags = cpu_flags()
+    if "amx_int8" in flags:
+        return "amx"
+    if flags & {"avx512_vnni", "avx_vnni"}:
+        return "vnni"
+    return platform.machine()
+
+
+def _cpuinfo(name: str) -> str:
+    """What the system says of its first CPU; empty where it doesn't."""
     with suppress(OSError):  # only on Linux
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             key, _, value = line.partition(":")
-            if key.strip() == "model name":
-                model = value.strip()
-                break
-    return f"{model}, {cpu_count()} CPUs"
+            if key.strip() == name:
+                return value.strip()
+    return ""

@@ -24,7 +24,7 @@ from deepshade.bundles import Bundle
 from deepshade.engines import Backend, usable
 from deepshade.errors import DeepshadeError
 from deepshade.files import replacing
-from deepshade.machine import describe
+from deepshade.machine import cpu_flags, describe
 from deepshade_service.measurement import Measurement, measure
 
 log = logging.getLogger("deepshade.service")
@@ -164,15 +164,7 @@ def _read(path: Path) -> dict[str, Any]:
 @cache
 def _machine() -> str:
     """The processor with all its instructions: the same name may come with fewer of them."""
-    flags = ""
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith(("flags", "Features")):
-                flags = line
-                break
-    except OSError:
-        pass
-    return describe() + sha256(flags.encode()).hexdigest()[:16]
+    return describe() + sha256(" ".join(sorted(cpu_flags())).encode()).hexdigest()[:16]
 
 
 @cache

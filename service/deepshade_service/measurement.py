@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 from deepshade import probe
 from deepshade.bundles import Bundle
 from deepshade.engines import REFERENCE, Backend, Engine, load_engine
+from deepshade.machine import cpu_kind
 from deepshade_service.tiles import padded
 
 log = logging.getLogger("deepshade.service")
 
 # The sizes timed, (height, width); in each pass the median of several runs, of at least two.
 _SIZES = ((256, 384), (512, 768))
-_PASSES, _RUNS, _SECONDS = 3, 5, 0.6
+_PASSES, _RUNS, _SECONDS = 6, 3, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,13 +66,27 @@ def published(bundle: Bundle) -> float | None:
 
 
 def published_added(bundle: Bundle, backend: Backend) -> float | None:
-    """The largest share of the error that the backend added in the bundle's own tests."""
-    tests = bundle.metrics.get("backends")
+    """The largest share of the error that the backend added in the bundle's own tests.
+
+    In those on this kind of CPU, or on all kinds where there were none on this one.
+    """
+    kinds = bundle.metrics.get("backends")
+    kinds = kinds if isinstance(kinds, dict) else {}
+    return max(
+        _added(kinds.get(cpu_kind()), backend)
+        or [added for kind in kinds.values() for added in _added(kind, backend)],
+        default=None,
+    )
+
+
+def _added(kind: Any, backend: Backend) -> list[float]:
+    """What the tests on one kind of CPU found; they come from a file."""
     found = []
+    tests = kind.get("tests") if isinstance(kind, dict) else None
     for test in tests.values() if isinstance(tests, dict) else ():
         with suppress(KeyError, TypeError, ValueError):
             found.append(float(test[str(backend)]["added"]))
-    return max(filter(math.isfinite, found), default=None)
+    return list(filter(math.isfinite, found))
 
 
 def measure(
@@ -144,7 +159,7 @@ class _Subject:
         if windows and base:
             there = probe.dssim(self._engine, windows)
             added = there / base - 1
-            # Many views tell more than the probe's few; but they weren't shaded on this CPU.
+            # Many views tell more than the probe's few; but they weren't shaded here.
             if (tested := published_added(bundle, backend)) is not None:
                 added = max(added, tested)
             self._added, self._dssim = added, there if own is None else own * (1 + added)

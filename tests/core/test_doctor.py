@@ -1,6 +1,7 @@
 """`deepshade doctor`, libLLVM's search, and what the machine allows."""
 
 import json
+import platform
 import socket
 
 import pytest
@@ -60,6 +61,18 @@ def test_cgroup_quota(tmp_path):
     (tmp_path / "memory.max").write_text("max\n")
     assert machine.memory_bytes(tmp_path) > 1 << 20
     assert machine.cpu_count() >= 1
+
+
+def test_the_kind_of_cpu_is_what_it_multiplies_8_bits_with(monkeypatch):
+    for flags, kind in (
+        ({"sse2", "avx512_vnni", "amx_int8", "amx_tile"}, "amx"),
+        ({"sse2", "avx512_vnni"}, "vnni"),
+        ({"sse2", "avx_vnni"}, "vnni"),
+        ({"sse2", "avx2"}, platform.machine()),
+        (set(), platform.machine()),
+    ):
+        monkeypatch.setattr(machine, "cpu_flags", lambda found=flags: frozenset(found))
+        assert machine.cpu_kind() == kind
 
 
 def test_engines_are_listed(monkeypatch):

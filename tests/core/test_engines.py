@@ -22,6 +22,7 @@ from deepshade.engines import (
     available,
     known,
     load_engine,
+    openvino,
     usable,
 )
 from deepshade.machine import resident, trim
@@ -259,6 +260,12 @@ def test_what_is_not_there_says_how_to_get_it(slopes, monkeypatch):
     assert set(usable(slopes)) == set(HERE)
     assert set(available()) <= set(known())
     assert available()[0] == REFERENCE
+
+
+def test_where_openvino_miscalculates_8_bits_it_does_not_offer_them(monkeypatch):
+    plain = openvino.precisions()
+    monkeypatch.setattr(openvino, "cpu_kind", lambda: "amx")
+    assert openvino.precisions() == tuple(name for name in plain if name != "int8")
 
 
 def test_a_graph_that_cannot_be_read(tmp_path):

@@ -13,10 +13,11 @@ import pytest
 from deepshade import metrics
 from deepshade.bundles import Bundle, write_config
 from deepshade.engines import REFERENCE, Backend, EngineError, usable
+from deepshade.machine import cpu_kind
 from deepshade.probe import write_probe
 from deepshade_service import measurement
 from deepshade_service.calibration import Calibration, chosen_path
-from deepshade_service.measurement import Measurement, published
+from deepshade_service.measurement import Measurement, published, published_added
 from deepshade_service.models import Models, fastest
 
 BF16, INT8 = Backend("openvino", "bf16"), Backend("openvino", "int8")
@@ -48,10 +49,23 @@ def test_what_the_bundles_own_tests_found_counts_if_it_is_more(bundle):
     """Beside itself the probe finds nothing added."""
     for added, expected in ((0.05, 0.05), (-0.05, 0.0), (float("nan"), 0.0)):
         tests = {"a": {str(REFERENCE): {"added": added}}, "b": {str(REFERENCE): {}}, "c": None}
-        known = replace(bundle, metrics={**bundle.metrics, "backends": tests})
+        metrics = {**bundle.metrics, "backends": {cpu_kind(): {"tests": tests}, "b": None}}
+        known = replace(bundle, metrics=metrics)
         (found,) = Calibration(None, threads=1).measure(known, [REFERENCE])
         assert found.added == pytest.approx(expected)
         assert found.dssim == pytest.approx(0.04 * (1 + expected))
+
+
+def test_tests_on_another_kind_of_cpu_count_where_there_are_none_on_this(bundle):
+    def added(**kinds):
+        found = {kind: {"tests": {"t": {str(INT8): {"added": a}}}} for kind, a in kinds.items()}
+        return published_added(replace(bundle, metrics={"backends": found}), INT8)
+
+    here = cpu_kind()
+    assert added(**{here: 0.01, "other": 0.3}) == 0.01
+    assert added(other=0.3, third=0.2) == 0.3
+    assert added(**{here: float("nan"), "other": 0.3}) == 0.3
+    assert added() is None
 
 
 def test_a_measurement_is_kept_and_found_again(bundle, tmp_path):

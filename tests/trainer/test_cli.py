@@ -11,6 +11,7 @@ from PIL import Image
 
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.cli import main
+from deepshade.machine import cpu_kind, describe
 
 SETTINGS = [
     "steps=4",
@@ -49,12 +50,25 @@ def test_train_export_evaluate(
     assert set(document["views"][0]) >= {"scene", "ssim", "psnr", "mae", "flip", "trivial_ssim"}
     assert np.asarray(Image.open(sheet)).shape[2] == 3
     assert errors["exact"]["views"] >= 3
-    assert "## Engines and precision" in card
+    assert f"### {cpu_kind()}: {describe()}" in card
     assert (document["engine"], document["precision"]) == ("onnxruntime", "fp32")
     assert main([*evaluate, "--engine", "openvino", "--json"]) == 0
     other_engine = json.loads(capsys.readouterr().out)
     assert other_engine["engine"] == "openvino"
     assert other_engine["mean"]["ssim"] == pytest.approx(document["mean"]["ssim"], abs=1e-3)
+    # another kind of CPU's table stays, and so does all around the tables
+    figures = json.loads((bundle / "metrics.json").read_text())
+    figures["backends"]["z80"] = figures["backends"][cpu_kind()] | {"machine": "a home computer"}
+    (bundle / "metrics.json").write_text(json.dumps(figures))
+    assert main(["evaluate", str(bundle), "--data", str(data), "--card"]) == 0
+    capsys.readouterr()
+    again = (bundle / "README.md").read_text()
+    assert Bundle.load(bundle).metrics["backends"].keys() == {cpu_kind(), "z80"}
+    assert "### z80: a home computer" in again
+    assert f"### {cpu_kind()}: {describe()}" in again
+    heading = "## Engines and precision"
+    assert again.split(heading)[0] == card.split(heading)[0]
+    assert again.split("## Recipe")[1] == card.split("## Recipe")[1]
     assert main([*evaluate, "--precision", "fp64"]) == 2
     assert "no precision 'fp64'" in capsys.readouterr().err
     assert main(evaluate) == 0

@@ -105,11 +105,12 @@ def test_an_export_brings_an_int8_graph_and_a_probe(bundle: Bundle, data: Path) 
     """Eight bits stay near 32, and the probe's error equals the evaluation's by hand."""
     assert bundle.int8 is not None
     int8 = onnx.load(str(bundle.int8))
-    quantised = {node.input[0] for node in int8.graph.node if node.op_type == "Conv"}
-    exact = [name for name in quantised if "DequantizeLinear" not in name]
-    # The first convolutions and the last stay in float.
+    inputs = [node.input[0] for node in int8.graph.node if node.op_type == "Conv"]
+    exact = [name for name in inputs if "DequantizeLinear" not in name]
+    # The first convolutions and the last two stay in float.
     assert "gbuffer" in {n.input[0] for n in int8.graph.node if set(n.output) & set(exact)}
-    assert 2 <= len(exact) < len(quantised)
+    assert 3 <= len(exact) < len(inputs)
+    assert set(inputs[-2:]) <= set(exact)
     windows = read_probe(bundle)
     assert 1 <= len(windows) <= 4
     errors = {}

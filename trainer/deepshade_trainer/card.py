@@ -14,14 +14,16 @@ import numpy as np
 
 from deepshade.bundles import METRICS, Bundle
 from deepshade.engines import REFERENCE, load_engine, usable
+from deepshade.errors import BundleError
 from deepshade.files import replacing
-from deepshade.machine import cpu_count, describe
+from deepshade.machine import cpu_count, cpu_kind, describe
 
 from .evaluation import Variant, evaluate, summary
 from .recipe import Recipe
 from .run import Run
 
 SPEED_SIZE = (768, 512)
+_BACKENDS = "## Engines and precision"
 # Normals need no 16-bit row: shards hold them so.
 VARIANTS = {
     "exact": Variant(),
@@ -33,11 +35,9 @@ VARIANTS = {
 
 
 def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
-    """Add to its metrics: errors over each test folder, and the speed, of every backend here.
+    """Add to its metrics: errors over each test folder, and what every backend here adds.
 
-    `error` holds, for each folder, the summary under every variant of the inputs in fp32, and
-    `backends`, for the last folder, each other backend's on the exact inputs, with `added`, its
-    DSSIM over fp32's - 1.
+    `error` holds, for each folder, the summary under every variant of the inputs in fp32.
     """
     errors = {
         folder.name: {
@@ -46,15 +46,30 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
         }
         for folder in folders
     }
-    others = [backend for backend in usable(bundle) if backend != REFERENCE]
-    backends: dict[str, Any] = {}
-    for folder in folders[-1:]:  # of real views, by habit: they take as long as all the variants
-        exact = errors[folder.name]["exact"]["dssim"]
-        backends[folder.name] = {}
-        for backend in others:
+    found = _with_metrics(bundle, {"error": errors})
+    # Of real views, by habit: the backends take as long as all the variants.
+    return measure_backends(found, folders[-1])
+
+
+def measure_backends(bundle: Bundle, folder: Path) -> Bundle:
+    """Add to its metrics the speed of every backend here, and what it adds to the error.
+
+    Under `backends`, by kind of CPU: the machine, milliseconds, and for the test folder each other
+    backend's summary, with `added`, its DSSIM over that in fp32 - 1. Other kinds' stay.
+    """
+    exact = summary(list(evaluate(bundle, [folder])))["dssim"]
+    tests: dict[str, Any] = {}
+    for backend in usable(bundle):
+        if backend != REFERENCE:
             mean = summary(list(evaluate(bundle, [folder], backend=backend)))
-            backends[folder.name][str(backend)] = {**mean, "added": mean["dssim"] / exact - 1}
-    found = {**bundle.metrics, "error": errors, "backends": backends, "speed": speed(bundle)}
+            tests[str(backend)] = {**mean, "added": mean["dssim"] / exact - 1}
+    here = {**speed(bundle), "tests": {folder.name: tests}}
+    kinds = {**bundle.metrics.get("backends", {}), cpu_kind(): here}
+    return _with_metrics(bundle, {"backends": kinds})
+
+
+def _with_metrics(bundle: Bundle, more: dict[str, Any]) -> Bundle:
+    found = {**bundle.metrics, **more}
     with replacing(bundle.path / METRICS) as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
     return dataclasses.replace(bundle, metrics=found)
@@ -81,13 +96,7 @@ def speed(bundle: Bundle, repeats: int = 9) -> dict[str, Any]:
             if turn > 1:
                 times[str(engine.backend)].append(1e3 * (time.perf_counter() - start))
     medians = {name: round(float(np.median(taken)), 2) for name, taken in times.items()}
-    return {
-        "size": [width, height],
-        "engine": str(backends[0]),
-        "median_ms": medians[str(backends[0])],
-        "backends": medians,
-        "machine": describe(),
-    }
+    return {"machine": describe(), "size": [width, height], "ms": medians}
 
 
 def write_card(bundle: Bundle, run: Run, note: str) -> None:
@@ -133,27 +142,48 @@ def write_card(bundle: Bundle, run: Run, note: str) -> None:
         temporary.write_text(text)
 
 
+def update_card(bundle: Bundle) -> None:
+    """Write the backends' table of the bundle's README.md anew, the rest stays.
+
+    Raises:
+        BundleError: there is no card with such a table.
+    """
+    path = bundle.path / "README.md"
+    text = path.read_text() if path.is_file() else ""
+    before, heading, after = text.partition(_BACKENDS + "\n")
+    if not heading:
+        raise BundleError(f"{path} has no part '{_BACKENDS}'", fix="export the bundle again")
+    _, next_heading, rest = after.partition("\n## ")
+    with replacing(path) as temporary:
+        temporary.write_text(before + "\n".join(_backends(bundle)) + next_heading + rest)
+
+
 def _backends(bundle: Bundle) -> list[str]:
-    """Speed and error of every engine and precision, as a table."""
-    taken = bundle.metrics["speed"]
-    by_folder: dict[str, Any] = bundle.metrics.get("backends", {})
+    """Speed and error of every engine and precision, as a table for each kind of CPU."""
+    kinds: dict[str, Any] = bundle.metrics["backends"]
     lines = [
-        "## Engines and precision",
+        _BACKENDS,
         "",
-        f"Milliseconds of the network at {taken['size'][0]} x {taken['size'][1]} on "
-        f"{taken['machine']}, and what each precision adds to the DSSIM of fp32.",
+        "Milliseconds of the network, and what each precision adds to the DSSIM of fp32, by what "
+        "the CPU multiplies 8 bits with.",
         "",
-        "| engine | precision | ms | "
-        + " | ".join(f"added on {name}" for name in by_folder)
-        + " |",
-        "|---|---|---|" + "---|" * len(by_folder),
     ]
-    for name, milliseconds in sorted(taken["backends"].items(), key=lambda item: item[1]):
-        engine, _, precision = name.partition("/")
-        added = [
-            f"{100 * errors[name]['added']:+.2f} %" if name in errors else "0"
-            for errors in by_folder.values()
+    for kind, found in sorted(kinds.items()):
+        width, height = found["size"]
+        tests: dict[str, Any] = found["tests"]
+        added = " | ".join(f"added on {name}" for name in tests)
+        lines += [
+            f"### {kind}: {found['machine']}",
+            "",
+            f"| engine | precision | ms at {width} x {height} | {added} |",
+            "|---|---|---|" + "---|" * len(tests),
         ]
-        cells = [engine, precision, f"{milliseconds:.1f}", *added]
-        lines.append(f"| {' | '.join(cells)} |")
-    return [*lines, ""]
+        for name, milliseconds in sorted(found["ms"].items(), key=lambda item: item[1]):
+            engine, _, precision = name.partition("/")
+            errors = [
+                f"{100 * test[name]['added']:+.2f} %" if name in test else "0"
+                for test in tests.values()
+            ]
+            lines.append(f"| {' | '.join([engine, precision, f'{milliseconds:.1f}', *errors])} |")
+        lines.append("")
+    return lines

@@ -169,6 +169,14 @@ def evaluate(
     ] = 0.0,
     engine: Annotated[str, typer.Option(help="onnxruntime, openvino, …")] = "onnxruntime",
     precision: Annotated[str, typer.Option(help="fp32, bf16, fp16 or int8.")] = "fp32",
+    card: Annotated[
+        bool,
+        typer.Option(
+            "--card",
+            help="Then measure every engine and precision here, on the last --data, and note it in "
+            "the bundle's metrics and card for this kind of CPU.",
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Measure a bundle against references: SSIM, PSNR, MAE, FLIP of each view and the mean.
@@ -178,6 +186,8 @@ def evaluate(
       deepshade evaluate models/ao/balanced --data data/test --sheet out/sheet.png
 
       deepshade evaluate models/ao/fast --data data/test --engine openvino --precision bf16
+
+      deepshade evaluate models/ao/fast --data data/test --card
     """
     from rich.console import Console
     from rich.progress import track
@@ -187,6 +197,7 @@ def evaluate(
     from deepshade.bundles import Bundle
     from deepshade.engines import Backend
 
+    from .card import measure_backends, update_card
     from .evaluation import Variant, contact_sheet, document, summary
     from .evaluation import evaluate as measure
 
@@ -200,6 +211,9 @@ def evaluate(
     rows = list(track(shaded, "shading", console=noise, disable=not noise.is_terminal))
     if sheet is not None:
         pictures.save(sheet, contact_sheet(rows[:24]))
+    if card:
+        with noise.status("measuring every engine and precision"):
+            update_card(measure_backends(found, data[-1]))
     if as_json:
         typer.echo(json.dumps(document(found, rows, variant, backend)))
         return
