@@ -111,8 +111,8 @@ def _camera(plan: Plan) -> dict[str, Any]:
 
 
 def _effect(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
-    from deepshade.channels import near_misses
     from deepshade.errors import AmbiguousChannelError, DeepshadeError
+    from deepshade.nearmisses import near_misses
 
     missing: dict[str, Any] = {}
     derived: dict[str, str] = {}

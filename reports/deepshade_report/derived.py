@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from deepshade_report.frames import MEGAPIXELS
+from deepshade_report.sections import Sections, backend_of, default_backend, network_row, rows
 from deepshade_report.statistics import frontier
 from deepshade_report.subjects import NETWORK, PAPER_NETWORK
-from deepshade_report.targets import Sections, backend_of, default_backend, network_row, rows
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,7 @@ from deepshade_report import contenders, style
 from deepshade_report.context import Context
 from deepshade_report.measure_methods import dssim
 from deepshade_report.method import Method, View
-from deepshade_report.statistics import significant
-from deepshade_report.store import Skipped
-from deepshade_report.style import colour, themed
-from deepshade_report.subjects import PAPER, Network, identity
-from deepshade_report.targets import (
+from deepshade_report.sections import (
     Sections,
     backend_of,
     best_rival,
@@ -25,6 +21,10 @@ from deepshade_report.targets import (
     network_row,
     rows,
 )
+from deepshade_report.statistics import significant
+from deepshade_report.store import Skipped
+from deepshade_report.style import colour, themed
+from deepshade_report.subjects import PAPER, Network, identity
 
 PICTURE = "comparison.png"
 _CROP = 384  # pixels of the view that are shown, so that details can be seen

@@ -8,7 +8,7 @@ from importlib.resources import files
 from typing import Any
 
 from deepshade_report import derived, style
-from deepshade_report.targets import Sections, default_backend, network_row, rows
+from deepshade_report.sections import Sections, default_backend, network_row, rows
 
 # What would shorten each stage of a request, for the note under the latency plot.
 CUTS = {

@@ -14,8 +14,9 @@ from deepshade.errors import DeepshadeError
 from deepshade.files import replacing
 from deepshade_report import derived, page, plots, style
 from deepshade_report.context import Context, busy_share, machine
+from deepshade_report.sections import Sections
 from deepshade_report.store import FORMAT, VERSION, Section, Skipped, Store, finite, write_json
-from deepshade_report.targets import Sections, targets
+from deepshade_report.targets import targets
 
 # name -> about how many seconds it takes on two cores, for the progress bar
 SECTIONS = {

@@ -20,12 +20,13 @@ from deepshade.effects import EFFECTS
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade_service import problems
+from deepshade_service.candidate import Candidate
 from deepshade_service.choice import Choices
 from deepshade_service.config import Settings
 from deepshade_service.job import Answer, Job
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
-from deepshade_service.models import Candidate, Models, find_effect, not_ready
+from deepshade_service.models import Models, find_effect, not_ready
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.pool import Cancelled, Workers
 from deepshade_service.telemetry import MEDIA_TYPE as METRICS_TYPE

@@ -94,7 +94,7 @@ def _measure(bundle: Bundle, results: Calibration, anew: bool, noise: Any) -> No
 
 
 def _rows(bundle: Bundle, results: Calibration) -> list[dict[str, Any]]:
-    from deepshade_service.models import fastest
+    from deepshade_service.candidate import fastest
 
     known = results.all(bundle)
     chosen = fastest(known)

@@ -11,7 +11,8 @@ from deepshade_service.parameters import ShadeParameters
 from deepshade_service.problems import Problem
 
 if TYPE_CHECKING:
-    from deepshade_service.models import Candidate, Models
+    from deepshade_service.candidate import Candidate
+    from deepshade_service.models import Models
 
 DEFAULT = "balanced"
 

@@ -24,7 +24,7 @@ from deepshade_service.telemetry import Stopwatch
 from deepshade_service.uploads import Upload
 
 if TYPE_CHECKING:
-    from deepshade_service.models import Candidate
+    from deepshade_service.candidate import Candidate
 
 # Work that used more hands memory back at once, other work when the service is idle.
 _BIG = 512 * 2**20

@@ -5,50 +5,22 @@ from __future__ import annotations
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS, Effect
-from deepshade.engines import Backend, Engine, load_engine, usable
+from deepshade.engines import Backend, Engine, load_engine
 from deepshade.errors import EngineError, nearest
 from deepshade_service.calibration import Calibration
-from deepshade_service.measurement import Measurement, published
+from deepshade_service.candidate import Candidate, candidates_of, speed
+from deepshade_service.measurement import published
 from deepshade_service.problems import Problem
 
 log = logging.getLogger("deepshade.service")
 
-# What a backend may add to a bundle's error and still be chosen when nobody asked.
-MOST_ADDED = 0.02
 # Engines kept in memory beside each bundle's default: those that requests pinned.
 _PINNED = 4
-_TYPICAL = 768 * 512
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A bundle on a backend: what a request may get.
-
-    `dssim` is the error to expect on real views and `added` the share that the backend adds to
-    the bundle's own; None where nothing was measured. `default` marks what the bundle runs on
-    when a request says nothing of it, which is the fastest that adds at most `MOST_ADDED`.
-    """
-
-    bundle: Bundle
-    backend: Backend
-    dssim: float | None = None
-    added: float | None = None
-    fixed_ms: float | None = None
-    ms_per_megapixel: float | None = None
-    calibrated: bool = False
-    default: bool = False
-
-    def ms(self, pixels: int) -> float | None:
-        """Milliseconds of the network for so many computed pixels; None if never measured."""
-        if self.fixed_ms is None or self.ms_per_megapixel is None:
-            return None
-        return self.fixed_ms + self.ms_per_megapixel * pixels / 1e6
 
 
 class Models:
@@ -170,7 +142,7 @@ class Models:
                 available=[str(one.backend) for one in all_],
             )
         defaults = [one for one in fitting if one.default]
-        return defaults[0] if defaults else min(fitting, key=_speed)
+        return defaults[0] if defaults else min(fitting, key=speed)
 
     def engine(self, candidate: Candidate) -> Engine:
         """The candidate's engine, warm; blocks while it is loaded.
@@ -208,32 +180,9 @@ class Models:
         revision = -1 if self.calibration is None else self.calibration.revision
         made, candidates = self._known.get(bundle.path, (None, []))
         if made != revision:
-            candidates = self._list(bundle)
+            candidates = candidates_of(bundle, self.calibration)
             self._known[bundle.path] = revision, candidates
         return candidates
-
-    def _list(self, bundle: Bundle) -> list[Candidate]:
-        own = published(bundle)
-        known: dict[Backend, Measurement] = {}
-        backends = usable(bundle)
-        if self.calibration is not None:
-            known = {found.backend: found for found in self.calibration.all(bundle)}
-            backends = [b for b in backends if not self.calibration.failed(bundle, b)]
-        # What isn't measured yet could be anything: 32 bits until all of it is.
-        whole = bool(backends) and all(backend in known for backend in backends)
-        chosen = (fastest(known.values()) if whole else None) or next(iter(backends), None)
-        candidates = []
-        for backend in backends:
-            found = known.get(backend)
-            default = backend == chosen
-            if found is None:
-                dssim = own if backend.precision == "fp32" else None
-                candidates.append(Candidate(bundle, backend, dssim, default=default))
-                continue
-            dssim = found.dssim if found.dssim is not None else own
-            measured = (found.added, found.fixed_ms, found.ms_per_megapixel)
-            candidates.append(Candidate(bundle, backend, dssim, *measured, True, default))
-        return sorted(candidates, key=lambda one: not one.default)
 
     def _default(self, bundle: Bundle) -> Candidate:
         candidates = self._of(bundle)
@@ -274,30 +223,10 @@ class Models:
         return named[name]
 
 
-def fastest(known: Iterable[Measurement]) -> Backend | None:
-    """The fastest of the measured backends that adds at most `MOST_ADDED`; None if none does.
-
-    16 and 8 bits only count where their error is known; 32 bits are taken for exact.
-    """
-    good = [
-        found
-        for found in known
-        if (0.0 if found.added is None and found.backend.precision == "fp32" else found.added)
-        is not None
-        and (found.added or 0.0) <= MOST_ADDED
-    ]
-    return min(good, key=lambda found: found.ms(_TYPICAL)).backend if good else None
-
-
 def _error(bundle: Bundle) -> tuple[float, str]:
     """Known errors first; then by name."""
     error = published(bundle)
     return (float("inf") if error is None else error), bundle.name
-
-
-def _speed(candidate: Candidate) -> float:
-    ms = candidate.ms(_TYPICAL)
-    return float("inf") if ms is None else ms
 
 
 def find_effect(name: str) -> Effect:

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from deepshade_report import derived
-from deepshade_report.targets import GIB, default_backend, targets
+from deepshade_report.sections import default_backend
+from deepshade_report.targets import GIB, targets
 
 from .sections import NETWORKS, made_up
 

@@ -17,8 +17,9 @@ from deepshade.machine import cpu_kind
 from deepshade.probe import write_probe
 from deepshade_service import measurement
 from deepshade_service.calibration import Calibration, chosen_path
+from deepshade_service.candidate import fastest
 from deepshade_service.measurement import Measurement, published, published_added
-from deepshade_service.models import Models, fastest
+from deepshade_service.models import Models
 
 BF16, INT8 = Backend("openvino", "bf16"), Backend("openvino", "int8")
 

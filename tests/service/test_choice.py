@@ -10,8 +10,8 @@ import pytest
 
 from deepshade.bundles import Bundle
 from deepshade.engines import Backend
+from deepshade_service.candidate import Candidate
 from deepshade_service.choice import Choices
-from deepshade_service.models import Candidate
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.problems import Problem
 
