@@ -138,9 +138,9 @@ def _show(rows: list[dict[str, Any]]) -> None:
 
     from deepshade.console import stdout
 
-    table = Table(
-        "bundle", "engine", "precision", "ms", "fixed ms", "ms/Mpx", "DSSIM", "added", "", ""
-    )
+    columns = ["bundle", "engine", "precision", "ms", "fixed ms", "ms/Mpx", "DSSIM", "added"]
+    on_device = any("device_ms" in row for row in rows)
+    table = Table(*columns, *(["device ms"] if on_device else []), "")
     for row in rows:
         dssim = "unknown" if row["dssim"] is None else f"{row['dssim']:.4f}"
         added = "unknown" if row["added"] is None else f"{100 * row['added']:+.2f} %"
@@ -153,11 +153,11 @@ def _show(rows: list[dict[str, Any]]) -> None:
             f"{row['ms_per_megapixel']:.1f}",
             dssim,
             added,
-            _device(row) if "device_ms" in row else "",
+            *([_device(row)] if on_device else []),
             "default" if row["default"] else "",
         )
     stdout().print(table)
 
 
 def _device(row: dict[str, Any]) -> str:
-    return "" if row["device_ms"] is None else f"{row['device_ms']:.2f} on the device"
+    return "" if row["device_ms"] is None else f"{row['device_ms']:.2f}"
