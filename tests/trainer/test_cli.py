@@ -59,6 +59,7 @@ def test_train_export_evaluate(
     # another kind of CPU's table stays, and so does all around the tables
     figures = json.loads((bundle / "metrics.json").read_text())
     figures["backends"]["z80"] = figures["backends"][cpu_kind()] | {"machine": "a home computer"}
+    figures["backends"]["test"] = {"openvino/bf16": {"added": 0.1}}  # as it was kept once
     (bundle / "metrics.json").write_text(json.dumps(figures))
     assert main(["evaluate", str(bundle), "--data", str(data), "--card"]) == 0
     capsys.readouterr()
@@ -69,6 +70,9 @@ def test_train_export_evaluate(
     heading = "## Engines and precision"
     assert again.split(heading)[0] == card.split(heading)[0]
     assert again.split("## Recipe")[1] == card.split("## Recipe")[1]
+    (bundle / "README.md").unlink()
+    assert main(["evaluate", str(bundle), "--data", str(data), "--card"]) == 2
+    assert "has no part" in capsys.readouterr().err
     assert main([*evaluate, "--precision", "fp64"]) == 2
     assert "no precision 'fp64'" in capsys.readouterr().err
     assert main(evaluate) == 0

@@ -64,8 +64,9 @@ def measure_backends(bundle: Bundle, folder: Path) -> Bundle:
             mean = summary(list(evaluate(bundle, [folder], backend=backend)))
             tests[str(backend)] = {**mean, "added": mean["dssim"] / exact - 1}
     here = {**speed(bundle), "tests": {folder.name: tests}}
-    kinds = {**bundle.metrics.get("backends", {}), cpu_kind(): here}
-    return _with_metrics(bundle, {"backends": kinds})
+    others = bundle.metrics.get("backends", {})
+    kept = {kind: found for kind, found in others.items() if found.keys() >= here.keys()}
+    return _with_metrics(bundle, {"backends": {**kept, cpu_kind(): here}})
 
 
 def _with_metrics(bundle: Bundle, more: dict[str, Any]) -> Bundle:
@@ -142,8 +143,10 @@ def write_card(bundle: Bundle, run: Run, note: str) -> None:
         temporary.write_text(text)
 
 
-def update_card(bundle: Bundle) -> None:
-    """Write the backends' table of the bundle's README.md anew, the rest stays.
+def refresh(bundle: Bundle, folder: Path) -> None:
+    """Measure every backend on this kind of CPU, and write the card's table of them anew.
+
+    All else in the bundle's README.md stays.
 
     Raises:
         BundleError: there is no card with such a table.
@@ -154,8 +157,9 @@ def update_card(bundle: Bundle) -> None:
     if not heading:
         raise BundleError(f"{path} has no part '{_BACKENDS}'", fix="export the bundle again")
     _, next_heading, rest = after.partition("\n## ")
+    lines = _backends(measure_backends(bundle, folder))
     with replacing(path) as temporary:
-        temporary.write_text(before + "\n".join(_backends(bundle)) + next_heading + rest)
+        temporary.write_text(before + "\n".join(lines) + next_heading + rest)
 
 
 def _backends(bundle: Bundle) -> list[str]:

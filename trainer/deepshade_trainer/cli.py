@@ -197,7 +197,7 @@ def evaluate(
     from deepshade.bundles import Bundle
     from deepshade.engines import Backend
 
-    from .card import measure_backends, update_card
+    from .card import refresh
     from .evaluation import Variant, contact_sheet, document, summary
     from .evaluation import evaluate as measure
 
@@ -213,7 +213,7 @@ def evaluate(
         pictures.save(sheet, contact_sheet(rows[:24]))
     if card:
         with noise.status("measuring every engine and precision"):
-            update_card(measure_backends(found, data[-1]))
+            refresh(found, data[-1])
     if as_json:
         typer.echo(json.dumps(document(found, rows, variant, backend)))
         return

@@ -53,7 +53,7 @@ def precisions(engine: str = "openvino") -> tuple[str, ...]:
     """What this CPU does natively, and rightly. Raises EngineError where OpenVINO isn't installed.
 
     With AMX, 8 bits on a graph of free size crash or come out wrong (issue 37577 of
-    openvinotoolkit/openvino; 15 to 30 % more DSSIM in OpenVINO 2026.4.1): not there.
+    openvinotoolkit/openvino; up to 30 % more DSSIM in OpenVINO 2026.4.1): not there.
     """
     known = set(_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"))
     if cpu_kind() == "amx":
