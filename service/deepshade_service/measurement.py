@@ -152,8 +152,6 @@ class _Subject:
         self._windows = windows
         self._sizes = [padded(*size, bundle.size_multiple) for size in _SIZES]
         self._times: list[list[float]] = [[] for _ in self._sizes]
-        for height, width in self._sizes:
-            self._engine.prepare(height, width)
         own = published(bundle)
         self._dssim, self._added = None, None
         if windows and base:
@@ -170,6 +168,7 @@ class _Subject:
     def time(self) -> None:
         """One pass."""
         for (height, width), times in zip(self._sizes, self._times, strict=True):
+            self._engine.prepare(height, width)  # here, where its memory is given back
             gbuffer = _picture(self._engine.channels, height, width, self._windows)
             times.append(_median_ms(self._engine, gbuffer))
         self._engine.shrink()

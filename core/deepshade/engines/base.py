@@ -71,7 +71,10 @@ class Engine(ABC):
             return self._run(gbuffer, max(1, self.threads // at_once))
 
     def prepare(self, height: int, width: int) -> None:  # noqa: B027 (most need nothing)
-        """Be as fast as can be for inputs of this size; blocks. Otherwise that comes with use."""
+        """Be as fast as can be for one input of this size at a time; blocks.
+
+        Otherwise that comes with use.
+        """
 
     def device_ms(self, gbuffer: Float, runs: int = 20) -> float | None:
         """Median milliseconds of a prediction whose pixels are on the device and stay there.

@@ -92,9 +92,7 @@ class OpenVino(Engine):
 
     def prepare(self, height: int, width: int) -> None:
         """See `Engine.prepare`."""
-        shape = (1, self.channels, height, width)
-        for threads in {self.threads, 1}:
-            self._fix((shape, threads))
+        self._fix(((1, self.channels, height, width), self.threads))
 
     def shrink(self) -> None:
         """See `Engine.shrink`."""
