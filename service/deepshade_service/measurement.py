@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from deepshade import probe
 from deepshade.bundles import Bundle
 from deepshade.engines import REFERENCE, Backend, Engine, load_engine
-from deepshade.machine import cpu_kind
+from deepshade.machine import cpu_kind, trim
 from deepshade_service.tiles import padded
 
 log = logging.getLogger("deepshade.service")
@@ -172,6 +172,7 @@ class _Subject:
             gbuffer = _picture(self._engine.channels, height, width, self._windows)
             times.append(_median_ms(self._engine, gbuffer))
         self._engine.shrink()
+        trim()
 
     def result(self) -> Measurement:
         """A line through the quietest pass at each size."""
