@@ -52,8 +52,8 @@ Shape = tuple[int, ...]
 def precisions(engine: str = "openvino") -> tuple[str, ...]:
     """What this CPU does natively, and rightly. Raises EngineError where OpenVINO isn't installed.
 
-    With AMX, 8 bits on a graph of free size crash or come out wrong (issue 37577 of
-    openvinotoolkit/openvino; up to 30 % more DSSIM in OpenVINO 2026.4.1): not there.
+    Not 8 bits with AMX: on graphs of free size they may crash there (issue 37577 of
+    openvinotoolkit/openvino), and with 2026.4.1 our bundles came out up to 30 % worse.
     """
     known = set(_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"))
     if cpu_kind() == "amx":
