@@ -70,7 +70,18 @@ def test_train_export_evaluate(
     heading = "## Engines and precision"
     assert again.split(heading)[0] == card.split(heading)[0]
     assert again.split("## Recipe")[1] == card.split("## Recipe")[1]
+    # a new 8-bit graph of other data: nothing is known of it until it is measured
+    before = Bundle.load(bundle)
+    assert main(["quantise", str(bundle), "--data", str(data)]) == 0
+    capsys.readouterr()
+    found = Bundle.load(bundle)
+    assert found.hashes["model.onnx"] == before.hashes["model.onnx"]
+    assert found.hashes["model.int8.onnx"] == before.hashes["model.int8.onnx"]  # of the same data
+    assert "| int8 |" in again
+    assert "| int8 |" not in (bundle / "README.md").read_text()
     (bundle / "README.md").unlink()
+    assert main(["quantise", str(bundle), "--data", str(data)]) == 2
+    assert Bundle.load(bundle).hashes == found.hashes
     assert main(["evaluate", str(bundle), "--data", str(data), "--card"]) == 2
     assert "has no part" in capsys.readouterr().err
     assert main([*evaluate, "--precision", "fp64"]) == 2

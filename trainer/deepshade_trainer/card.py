@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -143,13 +143,13 @@ def write_card(bundle: Bundle, run: Run, note: str) -> None:
         temporary.write_text(text)
 
 
-def refresh(bundle: Bundle, folder: Path) -> None:
-    """Measure every backend on this kind of CPU, and write the card's table of them anew.
+def refresh(bundle: Bundle, make: Callable[[], Bundle]) -> None:
+    """Write the table of backends in the bundle's card anew, after `make` has changed the figures.
 
     All else in the bundle's README.md stays.
 
     Raises:
-        BundleError: there is no card with such a table.
+        BundleError: there is no card with such a table; nothing was made.
     """
     path = bundle.path / "README.md"
     text = path.read_text() if path.is_file() else ""
@@ -157,7 +157,7 @@ def refresh(bundle: Bundle, folder: Path) -> None:
     if not heading:
         raise BundleError(f"{path} has no part '{_BACKENDS}'", fix="export the bundle again")
     _, next_heading, rest = after.partition("\n## ")
-    lines = _backends(measure_backends(bundle, folder))
+    lines = _backends(make())
     with replacing(path) as temporary:
         temporary.write_text(before + "\n".join(lines) + next_heading + rest)
 

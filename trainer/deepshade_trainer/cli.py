@@ -197,7 +197,7 @@ def evaluate(
     from deepshade.bundles import Bundle
     from deepshade.engines import Backend
 
-    from .card import refresh
+    from .card import measure_backends, refresh
     from .evaluation import Variant, contact_sheet, document, summary
     from .evaluation import evaluate as measure
 
@@ -213,7 +213,7 @@ def evaluate(
         pictures.save(sheet, contact_sheet(rows[:24]))
     if card:
         with noise.status("measuring every engine and precision"):
-            refresh(found, data[-1])
+            refresh(found, lambda: measure_backends(found, data[-1]))
     if as_json:
         typer.echo(json.dumps(document(found, rows, variant, backend)))
         return
@@ -226,6 +226,27 @@ def evaluate(
     listing.add_row(f"mean of {len(rows)}", *(f"{mean[name]:.4f}" for name in shown))
     Console().print(listing)
     typer.echo(f"DSSIM is {mean['ratio']:.3f} x the trivial answer's, on {backend}")
+
+
+def quantise(
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, such as models/ao/balanced.")],
+    data: Data,
+) -> None:
+    """Make a bundle's 8-bit graph anew, with the ranges that its numbers have on this data.
+
+    `export` makes one already. What it takes and costs is then unknown until it is measured:
+    deepshade evaluate models/ao/balanced --data data/test --card
+
+      deepshade quantise models/ao/balanced --data data/mine
+    """
+    from deepshade.bundles import Bundle
+
+    from .card import refresh
+    from .quantisation import requantise
+
+    found = Bundle.load(bundle)
+    refresh(found, lambda: requantise(found, data))
+    typer.echo(f"{bundle}: 8-bit graph made; next: deepshade evaluate {bundle} --card --data ...")
 
 
 def export(

@@ -220,3 +220,8 @@ def _permutation(count: int, seed: int, epoch: int) -> NDArray[np.int64]:
 def _unit(text: str) -> float:
     """A hash of `text` in [0, 1)."""
     return int.from_bytes(digest_of(text.encode()).digest()[:8], "little") / 2.0**64
+
+
+def spread(length: int, count: int) -> list[int]:
+    """Up to `count` different numbers below `length`, evenly from first to last."""
+    return sorted({int(k) for k in np.linspace(0, length - 1, count)}) if length else []

@@ -22,9 +22,9 @@ from deepshade.errors import DataError
 from deepshade.files import replacing
 from deepshade.probe import Window, write_probe
 
-from .dataset import Dataset
+from .dataset import Dataset, spread
 from .networks import Shader, build
-from .quantisation import quantise
+from .quantisation import examples, quantise
 from .recipe import Recipe
 from .run import Run
 
@@ -33,7 +33,6 @@ OPSET = 18
 # How far ONNX Runtime may stray from torch, both in float32, on values in [0, 1].
 TOLERANCE = 1e-4
 PARITY_SAMPLES = 8
-QUANTISATION_SAMPLES = 24
 PROBE_WINDOWS, PROBE_SIDE = 4, 256
 
 
@@ -81,15 +80,13 @@ def export(
         tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
         temporary.write_bytes(save(tensors))
     samples = Dataset(data, recipe.effect)
-    chosen = _spread(len(samples.entries), PARITY_SAMPLES)
+    chosen = spread(len(samples.entries), PARITY_SAMPLES)
     gbuffers = [samples.batch([number])[0] for number in chosen]
     worst = parity(model, folder / MODEL, gbuffers)
     if not worst <= TOLERANCE:
         raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
     training, held = samples.split(recipe.held_out)
-    some = [training[k] for k in _spread(len(training), QUANTISATION_SAMPLES)]
-    feeds = [samples.batch([number])[0].numpy() for number in some]
-    quantise(folder / MODEL, folder / INT8, INPUT, feeds)
+    quantise(folder / MODEL, folder / INT8, INPUT, examples(samples, training))
     windows = choose_probe(samples, held or training, model.size_multiple)
     if windows:
         write_probe(folder / PROBE, recipe.effect, windows)
@@ -142,12 +139,7 @@ def choose_probe(samples: Dataset, numbers: Sequence[int], multiple: int) -> lis
     alike = [entry for entry in found.values() if entry[2][0].shape[1] == side]
     best = sorted(alike, key=lambda entry: -entry[0])[: max(PROBE_WINDOWS, len(alike) // 3)]
     ordered = sorted(best, key=lambda entry: entry[1])
-    return [ordered[k][2] for k in _spread(len(ordered), PROBE_WINDOWS)]
-
-
-def _spread(length: int, count: int) -> list[int]:
-    """Up to `count` different numbers below `length`, evenly from first to last."""
-    return sorted({int(k) for k in np.linspace(0, length - 1, count)}) if length else []
+    return [ordered[k][2] for k in spread(len(ordered), PROBE_WINDOWS)]
 
 
 def write_onnx(model: Shader, path: Path) -> None:
