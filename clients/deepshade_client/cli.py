@@ -103,7 +103,7 @@ def shade(
     as_json: AsJson = False,
 ) -> None:
     """Shade pictures and save the answers; or, with --explain, say how that would be done."""
-    from deepshade.channels import parse_mapping
+    from deepshade.gbuffer.channels import parse_mapping
     from deepshade_client import batch, report
     from deepshade_client.client import AsyncClient, Client
     from deepshade_client.request import Options

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from deepshade import exr
-from deepshade.channels import parse_mapping
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DeepshadeError
 from deepshade.gbuffer import GBuffer, load_gbuffer, source_name
+from deepshade.gbuffer.channels import parse_mapping
 from deepshade.problems import MEDIA_TYPE, facts_of, kind_of, type_uri
 
 Shade = Callable[[GBuffer], ArrayLike]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from deepshade.exr import Limits
-    from deepshade.gbufferplan import Plan
+    from deepshade.gbuffer.plan import Plan
 
 
 def inspect(
@@ -28,7 +28,7 @@ def inspect(
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
 ) -> None:
     """Show what EXR files hold, what it maps to, and what each effect still needs."""
-    from deepshade.channels import parse_mapping
+    from deepshade.gbuffer.channels import parse_mapping
 
     report = inspect_files(files, mapping=parse_mapping(map_ or ()), profile=profile, fov=fov)
     if json:
@@ -58,7 +58,7 @@ def inspect_files(
     from deepshade import exr
     from deepshade.attributes import ATTRIBUTES
     from deepshade.effects import EFFECTS
-    from deepshade.gbufferplan import plan_gbuffer
+    from deepshade.gbuffer.plan import plan_gbuffer
 
     limits = limits or exr.Limits()
     paths = [Path(file) for file in files]
@@ -112,7 +112,7 @@ def _camera(plan: Plan) -> dict[str, Any]:
 
 def _effect(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
     from deepshade.errors import AmbiguousChannelError, DeepshadeError
-    from deepshade.nearmisses import near_misses
+    from deepshade.gbuffer.suggestions import near_misses
 
     missing: dict[str, Any] = {}
     derived: dict[str, str] = {}

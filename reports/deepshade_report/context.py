@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from deepshade.errors import DeepshadeError
 from deepshade.machine import cpu_count, describe, memory_bytes
-from deepshade_report.clock import Pace
 from deepshade_report.store import Skipped, key_of
+from deepshade_report.timing import Pace
 
 if TYPE_CHECKING:
     from deepshade.bundles import Bundle

@@ -74,7 +74,7 @@ def _one(context: Context, store: Store, name: str, sections: Sections) -> Secti
     start = time.perf_counter()
     try:
         if name == "comparison":
-            from deepshade_report.measure_comparison import PICTURE, comparison
+            from deepshade_report.sections.comparison import PICTURE, comparison
 
             found, picture = comparison(context, sections)
             _write_bytes(context.out / PICTURE, picture)
@@ -88,23 +88,17 @@ def _one(context: Context, store: Store, name: str, sections: Sections) -> Secti
 
 
 def _measurer(name: str) -> Callable[[Context], dict[str, Any]]:
-    from deepshade_report import (
-        measure_gpu,
-        measure_methods,
-        measure_savings,
-        measure_service,
-        measure_sizes,
-    )
+    from deepshade_report.sections import gpu, methods, savings, service, sizes
 
     table: dict[str, Callable[[Context], dict[str, Any]]] = {
-        "error": measure_methods.error,
-        "speed": measure_methods.speed,
-        "service": measure_service.service,
-        "clients": measure_service.clients,
-        "sizes": measure_sizes.sizes,
-        "background": measure_sizes.background,
-        "savings": measure_savings.savings,
-        "gpu": measure_gpu.gpu,
+        "error": methods.error,
+        "speed": methods.speed,
+        "service": service.service,
+        "clients": service.clients,
+        "sizes": sizes.sizes,
+        "background": sizes.background,
+        "savings": savings.savings,
+        "gpu": gpu.gpu,
     }
     return table[name]
 
@@ -113,7 +107,7 @@ def write(
     context: Context, sections: Sections, seconds: float, *, partial_: bool = False
 ) -> dict[str, Any]:
     """report.json, the plots as PNG, and index.html, each replaced as a whole."""
-    from deepshade_report.measure_comparison import PICTURE
+    from deepshade_report.sections.comparison import PICTURE
 
     context.out.mkdir(parents=True, exist_ok=True)
     report = document(context, sections, seconds, partial_=partial_)

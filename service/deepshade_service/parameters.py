@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from deepshade.channels import parse_mapping
 from deepshade.errors import ConfigError
 from deepshade.exr import COMPRESSIONS
-from deepshade.profiles import PROFILES
+from deepshade.gbuffer.channels import parse_mapping
+from deepshade.gbuffer.profiles import PROFILES
 
 # Far beyond any scene, and safely inside what float32 can divide by.
 MIN_RADIUS, MAX_RADIUS = 1e-30, 1e30

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from deepshade import background
+from deepshade.gbuffer import background
 
 SPECIAL = [0.0, -0.0, 1.0, -1.0, 1e10, -1e10, 9e9, np.nan, np.inf, -np.inf, 1e-30]
 CHANNELS = {

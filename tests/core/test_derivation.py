@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from deepshade import derivation, geometry
 from deepshade.camera import Camera
+from deepshade.gbuffer import derivation, geometry
 
 
 def plane_seen(camera, normal, distance):

@@ -10,9 +10,11 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from deepshade import exr, exrchunks, exrdecode
+from deepshade import exr
 from deepshade.errors import DamagedImageError, ImageError, LimitError
 from deepshade.exr import Limits
+from deepshade.exr import chunks as exrchunks
+from deepshade.exr import decode as exrdecode
 from deepshade.threads import thread_count
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "exr"

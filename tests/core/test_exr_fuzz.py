@@ -8,7 +8,8 @@ import pytest
 CHILD = r"""
 import faulthandler, io, random, sys, time
 import numpy as np, OpenEXR
-from deepshade import exr, exrdecode
+from deepshade import exr
+from deepshade.exr import decode as exrdecode
 from deepshade.errors import DeepshadeError
 
 faulthandler.enable()

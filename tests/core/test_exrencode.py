@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepshade import exr, exrencode
-from deepshade.exrattributes import Cursor, read_part
+from deepshade import exr
+from deepshade.exr import encode as exrencode
+from deepshade.exr.attributes import Cursor, read_part
 from deepshade.threads import thread_count
 
 LIBRARY = {"zip": OpenEXR.ZIP_COMPRESSION, "zips": OpenEXR.ZIPS_COMPRESSION}

@@ -395,7 +395,7 @@ def test_pixels_need_not_be_square():
 def test_world_positions_take_little_memory():
     import tracemalloc
 
-    from deepshade import derivation
+    from deepshade.gbuffer import derivation
 
     points = np.ones((3, 512, 1024), "f")
     source = derivation.Source({"position_world": points}, points[0] > 0, matrix=CAMERA.matrix)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from deepshade import exr
-from deepshade.channels import parse_mapping
 from deepshade.cli import main
 from deepshade.errors import ConfigError
+from deepshade.gbuffer.channels import parse_mapping
 from deepshade.inspection import inspect_files
 
 

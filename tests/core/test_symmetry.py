@@ -7,7 +7,7 @@ import pytest
 
 from deepshade import symmetry
 from deepshade.camera import Camera
-from deepshade.geometry import normals_from_positions
+from deepshade.gbuffer.geometry import normals_from_positions
 
 
 def bumpy(size: int = 48) -> tuple[np.ndarray, np.ndarray]:

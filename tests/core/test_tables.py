@@ -10,7 +10,7 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, LimitError, MissingAttributeError, nearest
 from deepshade.extras import EXTRAS, extra_of
-from deepshade.profiles import PROFILES, QUANTITIES, detect, match_rank
+from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, detect, match_rank
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from deepshade.errors import DeepshadeError
-from deepshade_report import gtao, hbao
-from deepshade_report.horizons import open_field
+from deepshade_report.baselines.ao import gtao, hbao
+from deepshade_report.baselines.ao.horizons import open_field
 from deepshade_report.method import Float, View
 
 try:
-    from deepshade_report import compiled
+    from deepshade_report.baselines.ao import compiled
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
     pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deepshade_report import gtao
-from deepshade_report.gtao import GTAO, Parameters, occlude
-from deepshade_report.horizons import open_field
+from deepshade_report.baselines.ao import gtao
+from deepshade_report.baselines.ao.gtao import GTAO, Parameters, occlude
+from deepshade_report.baselines.ao.horizons import open_field
 
 from .walls import cast, degenerate, groove, rubble
 

@@ -15,7 +15,7 @@ import pytest
 
 from deepshade_report import plots, run, style
 from deepshade_report.context import Context
-from deepshade_report.measure_comparison import PICTURE
+from deepshade_report.sections.comparison import PICTURE
 
 from .sections import made_up
 

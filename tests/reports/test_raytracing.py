@@ -16,13 +16,13 @@ from deepshade_report.method import View
 from deepshade_report.views import load_views
 
 try:
-    from deepshade_report import raytracing
+    from deepshade_report.baselines.ao import raytracing
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Mitsuba, Open Image Denoise or libLLVM
     pytest.skip(f"no ray tracing here: {error}", allow_module_level=True)
 
 from deepshade_workers.datagen import Job, make_shard
-from deepshade_workers.mesh import Mesh, merge
-from deepshade_workers.scene import Scene
+from deepshade_workers.scenes.mesh import Mesh, merge
+from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.shards import schema
 from deepshade_workers.trace import trace
 

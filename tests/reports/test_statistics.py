@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepshade_report.clock import Pace, alternate, visits
 from deepshade_report.statistics import frontier, percentile, ratio, spread
+from deepshade_report.timing import Pace, alternate, visits
 
 values = st.floats(1e-3, 1e6)
 

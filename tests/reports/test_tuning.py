@@ -11,8 +11,8 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from deepshade_report import gtao, hbao, tuned, tuning
-from deepshade_report.horizons import open_field
+from deepshade_report.baselines.ao import gtao, hbao, tuned, tuning
+from deepshade_report.baselines.ao.horizons import open_field
 
 from .walls import rubble
 
@@ -46,11 +46,11 @@ def test_a_sweep_comes_near_what_the_reference_was_made_with() -> None:
 
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_what_is_shipped_is_the_outcome_of_a_sweep(name: str) -> None:
-    shipped = json.loads((files("deepshade_report") / "tuned.json").read_text("utf-8"))
+    shipped = json.loads((files("deepshade_report") / "baselines/ao/tuned.json").read_text("utf-8"))
     outcome = shipped[name]
     assert {field.name for field in fields(DEFAULTS[name])} == set(tuned.parameters(name))
     assert outcome["windows"]["ssim"] > outcome["windows"]["published"]
     subject = next(s for s in tuning.SUBJECTS if s.name == name)
     assert [tuple(row["setting"]) for row in outcome["table"]] == list(subject.settings)
     assert all(np.isfinite(row["ssim"]) for row in outcome["table"])
-    assert all("deepshade_report.tuning" in command for command in outcome["commands"])
+    assert all("deepshade_report.baselines.ao.tuning" in command for command in outcome["commands"])

@@ -19,10 +19,11 @@ from typer.testing import CliRunner
 from deepshade import exr
 from deepshade.bundles import write_config
 from deepshade.camera import Camera
-from deepshade.derivation import normals_from_positions
 from deepshade.errors import ConfigError
+from deepshade.gbuffer.derivation import normals_from_positions
 from deepshade.manifest import Manifest, Shard
-from deepshade_report import contenders, frames
+from deepshade_report import baselines as contenders
+from deepshade_report import frames
 from deepshade_report.cli import report
 from deepshade_report.subjects import Network, stacked
 from deepshade_report.views import load_views

@@ -11,7 +11,7 @@ import pytest
 from safetensors.numpy import save
 
 from deepshade.camera import Camera
-from deepshade.derivation import normals_from_positions
+from deepshade.gbuffer.derivation import normals_from_positions
 from deepshade.manifest import Manifest, Shard
 from deepshade_trainer.networks import NetworkConfig
 from deepshade_trainer.recipe import Recipe

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from deepshade_trainer.horizons import directions, horizons, sampled, unit
+from deepshade_trainer.networks.horizons import directions, horizons, sampled, unit
 
 # Of `horizons`: right, down, left, up, then the diagonals.
 RIGHT, DOWN, LEFT, UP = range(4)

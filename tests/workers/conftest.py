@@ -12,7 +12,7 @@ from deepshade.camera import Camera
 
 def quad(center: Any, u: Any, v: Any) -> Any:
     """A parallelogram center ± u ± v, facing u x v."""
-    from deepshade_workers.mesh import Mesh
+    from deepshade_workers.scenes.mesh import Mesh
 
     c, u, v = (np.array(x, np.float64) for x in (center, u, v))
     corners = np.stack([c - u - v, c + u - v, c + u + v, c - u + v])
@@ -28,8 +28,8 @@ def down() -> Camera:
 @pytest.fixture(scope="session")
 def corner() -> Any:
     """A floor at y = 0 that meets a wall at z = -1, both very large."""
-    from deepshade_workers.mesh import merge
-    from deepshade_workers.scene import Scene
+    from deepshade_workers.scenes.mesh import merge
+    from deepshade_workers.scenes.scene import Scene
 
     floor = quad((0, 0, 0), (500, 0, 0), (0, 0, -500))
     wall = quad((0, 0, -1), (500, 0, 0), (0, 500, 0))

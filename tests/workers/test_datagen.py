@@ -23,9 +23,9 @@ from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import Manifest
 from deepshade_workers.datagen import Job, expand_scenes, generate, make_sample, make_shard
-from deepshade_workers.loading import open_scene
-from deepshade_workers.procedural import FAMILIES
 from deepshade_workers.sample import render_sample
+from deepshade_workers.scenes.loading import open_scene
+from deepshade_workers.scenes.procedural import FAMILIES
 
 SCENES = ("procedural:stairs", "procedural:level", "procedural:rubble")
 JOB = Job(scenes=SCENES, views=12, size=32, frame=64, spp=16, seed=5, shard_size=3)

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from deepshade.errors import SceneError
-from deepshade_workers.loading import load_mesh, open_scene
+from deepshade_workers.scenes.loading import load_mesh, open_scene
 
 
 def cubes() -> trimesh.Scene:

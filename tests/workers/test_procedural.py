@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepshade_workers.procedural import FAMILIES, generate, primitives
-from deepshade_workers.procedural.interiors import curtain, random_cushion, vase
-from deepshade_workers.procedural.nature import leaf
+from deepshade_workers.scenes.procedural import FAMILIES, generate, primitives
+from deepshade_workers.scenes.procedural.interiors import curtain, random_cushion, vase
+from deepshade_workers.scenes.procedural.nature import leaf
 
 RNG = np.random.default_rng
 SOLIDS: dict[str, tuple[Any, float | None]] = {

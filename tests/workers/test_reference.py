@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from deepshade.camera import Camera
-from deepshade_workers.mesh import merge
-from deepshade_workers.procedural.primitives import box, place
-from deepshade_workers.reference import ambient_occlusion, rays_used, strata
-from deepshade_workers.scene import Scene
+from deepshade_workers.references.ao import ambient_occlusion, rays_used, strata
+from deepshade_workers.scenes.mesh import merge
+from deepshade_workers.scenes.procedural.primitives import box, place
+from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import trace
 
 from .conftest import quad

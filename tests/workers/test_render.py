@@ -13,7 +13,7 @@ from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.cli import main
 from deepshade.gbuffer import load_gbuffer
-from deepshade_workers.scene import SUN_DIRECTION, SUN_IRRADIANCE
+from deepshade_workers.scenes.scene import SUN_DIRECTION, SUN_IRRADIANCE
 
 VIEW = ["--eye", "2", "3", "4", "--target", "0", "0.4", "0", "--size", "48x32"]
 SCENE = "procedural:crockery:1"
@@ -68,7 +68,7 @@ def test_the_sun_lights_what_faces_it(tmp_path: Path) -> None:
     """An open floor under the default lights: sun, sky and lamp, all known in closed form."""
     from deepshade.camera import Camera
     from deepshade_workers.lighting import LAMP, direct_light
-    from deepshade_workers.scene import SKY_RADIANCE, Scene
+    from deepshade_workers.scenes.scene import SKY_RADIANCE, Scene
     from deepshade_workers.trace import trace
 
     from .conftest import quad

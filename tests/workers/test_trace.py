@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from deepshade.camera import Camera
-from deepshade.derivation import normals_from_positions
-from deepshade_workers.loading import open_scene
+from deepshade.gbuffer.derivation import normals_from_positions
+from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.trace import attributes, trace
 
 SPHERE = """<scene version="3.0.0">
@@ -70,7 +70,7 @@ def test_a_window_is_a_cut_from_the_whole_frame(corner: Any) -> None:
 
 
 def test_normals_face_the_camera_on_both_sides() -> None:
-    from deepshade_workers.scene import Scene
+    from deepshade_workers.scenes.scene import Scene
 
     from .conftest import quad
 

@@ -17,10 +17,9 @@ from deepshade.engines import REFERENCE, load_engine, usable
 from deepshade.errors import BundleError
 from deepshade.files import replacing
 from deepshade.machine import cpu_count, cpu_kind, describe
-
-from .evaluation import Variant, evaluate, summary
-from .recipe import Recipe
-from .run import Run
+from deepshade_trainer.evaluation import Variant, evaluate, summary
+from deepshade_trainer.recipe import Recipe
+from deepshade_trainer.run import Run
 
 SPEED_SIZE = (768, 512)
 _BACKENDS = "## Engines and precision"

@@ -46,9 +46,9 @@ def train(
         TimeRemainingColumn,
     )
 
-    from .recipe import preset as load_preset
-    from .run import Run
-    from .training import train as steps
+    from deepshade_trainer.recipe import preset as load_preset
+    from deepshade_trainer.run import Run
+    from deepshade_trainer.training import train as steps
 
     if threads:
         torch.set_num_threads(threads)
@@ -108,10 +108,9 @@ def search(
     from rich.table import Column, Table
 
     from deepshade.machine import cpu_count
-
-    from .recipe import preset as load_preset
-    from .search import frontier, label, read_trials
-    from .search import search as trials
+    from deepshade_trainer.recipe import preset as load_preset
+    from deepshade_trainer.search import frontier, label, read_trials
+    from deepshade_trainer.search import search as trials
 
     if threads:
         torch.set_num_threads(threads)
@@ -196,10 +195,9 @@ def evaluate(
     from deepshade import pictures
     from deepshade.bundles import Bundle
     from deepshade.engines import Backend
-
-    from .card import measure_backends, refresh
-    from .evaluation import Variant, contact_sheet, document, summary
-    from .evaluation import evaluate as measure
+    from deepshade_trainer.card import measure_backends, refresh
+    from deepshade_trainer.evaluation import Variant, contact_sheet, document, summary
+    from deepshade_trainer.evaluation import evaluate as measure
 
     found = Bundle.load(bundle)
     variant = Variant(tuple(name for name in half.split(",") if name), scale, stretch)
@@ -240,9 +238,8 @@ def quantise(
       deepshade quantise models/ao/balanced --data data/mine
     """
     from deepshade.bundles import Bundle
-
-    from .card import refresh
-    from .quantisation import requantise
+    from deepshade_trainer.card import refresh
+    from deepshade_trainer.quantisation import requantise
 
     found = Bundle.load(bundle)
     refresh(found, lambda: requantise(found, data))
@@ -268,10 +265,9 @@ def export(
     deepshade export runs/ao --out models/ao/balanced --data data/ao --test data/test
     """
     from deepshade.errors import ConfigError
-
-    from .card import measure, write_card
-    from .export import export as write
-    from .run import Run
+    from deepshade_trainer.card import measure, write_card
+    from deepshade_trainer.export import export as write
+    from deepshade_trainer.run import Run
 
     try:
         ending = note.read_text() if note else ""

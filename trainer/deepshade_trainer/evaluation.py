@@ -15,8 +15,7 @@ from deepshade.bundles import Bundle
 from deepshade.engines import REFERENCE, Backend, load_engine
 from deepshade.errors import ConfigError, DataError
 from deepshade.machine import cpu_count
-
-from .dataset import Dataset, Sample, rounded
+from deepshade_trainer.dataset import Dataset, Sample, rounded
 
 Image = NDArray[np.float32]
 FIGURES = ("ssim", "dssim", "psnr", "mae", "flip", "trivial_ssim", "trivial_dssim")

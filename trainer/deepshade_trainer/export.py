@@ -21,12 +21,11 @@ from deepshade.effects import EFFECTS
 from deepshade.errors import DataError
 from deepshade.files import replacing
 from deepshade.probe import Window, write_probe
-
-from .dataset import Dataset, spread
-from .networks import Shader, build
-from .quantisation import examples, quantise
-from .recipe import Recipe
-from .run import Run
+from deepshade_trainer.dataset import Dataset, spread
+from deepshade_trainer.networks import Shader, build
+from deepshade_trainer.quantisation import examples, quantise
+from deepshade_trainer.recipe import Recipe
+from deepshade_trainer.run import Run
 
 INPUT, OUTPUT = "gbuffer", "shade"
 OPSET = 18

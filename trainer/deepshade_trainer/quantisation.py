@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from deepshade.bundles import INT8, Bundle, write_config
 from deepshade.files import replacing
-
-from .dataset import Dataset, spread
-from .recipe import Recipe
+from deepshade_trainer.dataset import Dataset, spread
+from deepshade_trainer.recipe import Recipe
 
 Image = NDArray[np.float32]
 

@@ -12,9 +12,8 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError
 from deepshade.files import replacing
-
-from .losses import parse_loss
-from .networks import KINDS, NetworkConfig
+from deepshade_trainer.losses import parse_loss
+from deepshade_trainer.networks import KINDS, NetworkConfig
 
 CHOICES = {
     "effect": tuple(EFFECTS),

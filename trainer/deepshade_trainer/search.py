@@ -24,12 +24,11 @@ from deepshade.bundles import MODEL, WEIGHTS, Bundle, write_config
 from deepshade.effects import EFFECTS
 from deepshade.engines import Backend, EngineError, available, load_engine
 from deepshade.errors import ConfigError, DataError
-
-from .export import INPUT, OUTPUT, write_onnx
-from .networks import NetworkConfig, build
-from .recipe import Recipe
-from .run import Run
-from .training import Progress, train
+from deepshade_trainer.export import INPUT, OUTPUT, write_onnx
+from deepshade_trainer.networks import NetworkConfig, build
+from deepshade_trainer.recipe import Recipe
+from deepshade_trainer.run import Run
+from deepshade_trainer.training import Progress, train
 
 GROWTH = 3  # each rung of the ladder trains this many times as long as the one below
 ENOUGH = 4  # trials on a rung before its best climb

@@ -18,12 +18,11 @@ from torch import Tensor, nn
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing
-
-from .dataset import Batch, Dataset, batches
-from .losses import dssim, parse_loss
-from .networks import Shader, build
-from .recipe import Recipe
-from .run import Run
+from deepshade_trainer.dataset import Batch, Dataset, batches
+from deepshade_trainer.losses import dssim, parse_loss
+from deepshade_trainer.networks import Shader, build
+from deepshade_trainer.recipe import Recipe
+from deepshade_trainer.run import Run
 
 # Views whose reference varies less than this show nothing to judge (design, section 2).
 MIN_CONTRAST = {"ao": 0.12}

@@ -48,9 +48,8 @@ def render(
 
     from deepshade.camera import Camera
     from deepshade.errors import ConfigError
-
-    from .loading import open_scene
-    from .render import render as render_view
+    from deepshade_workers.render import render as render_view
+    from deepshade_workers.scenes.loading import open_scene
 
     if radius is not None and not (math.isfinite(radius) and radius > 0):
         raise ConfigError("radius", detail=f"the radius must be above 0, not {radius}")
@@ -139,7 +138,7 @@ def datagen(
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
-    from .datagen import Job, expand_scenes, generate, rate
+    from deepshade_workers.datagen import Job, expand_scenes, generate, rate
 
     job = Job(
         scenes=expand_scenes(scenes),
@@ -171,8 +170,7 @@ def datagen(
 
 def _known(effects: list[str]) -> list[str]:
     from deepshade.errors import ConfigError
-
-    from .reference import REFERENCES
+    from deepshade_workers.references.ao import REFERENCES
 
     for effect in effects:
         if effect not in REFERENCES:
@@ -223,7 +221,7 @@ class _progress:
         self.bar.stop()
 
     def report(self, done: int, total: int) -> None:
-        from .datagen import rate
+        from deepshade_workers.datagen import rate
 
         self.first = done if self.first is None else self.first
         speed = rate(done - self.first, self.begun)

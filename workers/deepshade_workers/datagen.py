@@ -18,10 +18,9 @@ import numpy as np
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import NAME, Manifest, Shard
-
-from .loading import PROCEDURAL, SUFFIXES, parse_procedural
-from .procedural import FAMILIES
-from .shards import Images, schema, shard_name, write_shard
+from deepshade_workers.scenes.loading import PROCEDURAL, SUFFIXES, parse_procedural
+from deepshade_workers.scenes.procedural import FAMILIES
+from deepshade_workers.shards import Images, schema, shard_name, write_shard
 
 # How often a sample whose scene shows nothing useful may ask for another scene.
 SCENE_TRIES = 16
@@ -109,9 +108,9 @@ def make_sample(job: Job, index: int) -> tuple[Images, dict[str, Any]]:
     The sample's own random stream picks scene, view, radius and noise, so it doesn't matter
     which worker renders it, or when.
     """
-    from .loading import open_scene
-    from .sample import render_sample
-    from .views import sample_view
+    from deepshade_workers.sample import render_sample
+    from deepshade_workers.scenes.loading import open_scene
+    from deepshade_workers.views import sample_view
 
     rng = np.random.default_rng([job.seed, index])
     choice = job.scenes[index % len(job.scenes)]
@@ -274,7 +273,7 @@ class Tally:
 def _shard_task(job: Job, index: int, folder: str, home: str, tally: Any) -> Shard:
     import drjit as dr
 
-    from .backend import mitsuba
+    from deepshade_workers.backend import mitsuba
 
     os.chdir(home)  # scenes may have relative names
     mitsuba()

@@ -9,10 +9,10 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from .backend import mitsuba
-from .reference import offset_origin, pixel_streams, random_pair
-from .scene import Scene
-from .trace import Hits, material
+from deepshade_workers.backend import mitsuba
+from deepshade_workers.references.ao import offset_origin, pixel_streams, random_pair
+from deepshade_workers.scenes.scene import Scene
+from deepshade_workers.trace import Hits, material
 
 mi = mitsuba()
 

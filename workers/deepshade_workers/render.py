@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade import derivation, exr
+from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS
-
-from .lighting import direct_light
-from .reference import rays_used
-from .sample import Images, render_sample
-from .scene import Scene
+from deepshade.gbuffer import derivation
+from deepshade_workers.lighting import direct_light
+from deepshade_workers.references.ao import rays_used
+from deepshade_workers.sample import Images, render_sample
+from deepshade_workers.scenes.scene import Scene
 
 LIGHT_SAMPLES = 64
 # Bounded values lose nothing to speak of in 16 bits; lengths and references keep 32.

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.camera import Camera
-
-from .reference import REFERENCES
-from .scene import Scene
-from .trace import Hits, attributes, trace
+from deepshade_workers.references.ao import REFERENCES
+from deepshade_workers.scenes.scene import Scene
+from deepshade_workers.trace import Hits, attributes, trace
 
 Images = dict[str, NDArray[np.float32]]
 

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.camera import Camera, rotation_of
-
-from .backend import mitsuba
-from .scene import MATERIAL_CHANNELS, Scene
+from deepshade_workers.backend import mitsuba
+from deepshade_workers.scenes.scene import MATERIAL_CHANNELS, Scene
 
 mi = mitsuba()
 

@@ -8,11 +8,10 @@ import numpy as np
 
 from deepshade.camera import Camera
 from deepshade.errors import SceneError
-
-from .mesh import Floats
-from .reference import ambient_occlusion
-from .scene import Scene
-from .trace import Hits, trace
+from deepshade_workers.references.ao import ambient_occlusion
+from deepshade_workers.scenes.mesh import Floats
+from deepshade_workers.scenes.scene import Scene
+from deepshade_workers.trace import Hits, trace
 
 FOV = 50.0
 PROBE = 48

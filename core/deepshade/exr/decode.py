@@ -1,0 +1,205 @@
+"""Decodes the wanted channels of EXR parts: strip by strip, on several threads."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from deepshade import floats
+from deepshade.errors import DamagedImageError
+from deepshade.exr.header import Part
+from deepshade.threads import run_all, thread_count
+
+Pixels = NDArray[np.float32]
+Repeats = Mapping[int, Sequence[int]]
+
+# Bytes decoded at a time, with all the part's channels. Smaller strips take less memory and keep
+# more threads busy; but opening the library's file for each takes some 50 µs.
+_MOST = 8 * 2**20
+_LEAST = 2**20
+
+# Bytes of a decoded chunk from which on it is decoded once if it is there several times: less
+# is decoded sooner than set apart.
+_WORTH_COMPARING = 2**14
+
+_TYPES: dict[str, np.dtype[Any]] = {
+    "half": np.dtype("<f2"),
+    "float": np.dtype("<f4"),
+    "uint": np.dtype("<u4"),
+}
+
+
+@dataclass(slots=True)
+class Wanted:
+    """A part and its wanted channels: name in the part -> C-contiguous (H, W), to be filled.
+
+    Decoding notes in `nonfinite` which of them hold NaN or infinities.
+    """
+
+    part: Part
+    planes: dict[str, Pixels]
+    nonfinite: set[str] = field(default_factory=set)
+
+
+def decode(data: bytes, wanted: Sequence[Wanted]) -> None:
+    """Fills the planes of all the parts that are `wanted` from the bytes of their file.
+
+    Chunks with the same bytes, as background has, are decoded once. Raises DamagedImageError.
+    """
+    threads = thread_count()
+    distinct = [_distinct(data, each.part) for each in wanted]
+    shares = [
+        each.part.decoded_bytes * len(rows) // each.part.chunks.rows
+        for each, (rows, _) in zip(wanted, distinct, strict=True)
+    ]
+    piece = min(_MOST, max(_LEAST, -(-sum(shares) // threads)))
+    strips = [
+        (each, strip, repeats)
+        for each, (rows, repeats), share in zip(wanted, distinct, shares, strict=True)
+        for strip in _strips(each.part, rows, -(-share // piece))
+    ]
+    run_all(lambda strip: _decode(data, *strip), strips, threads)
+
+
+def _distinct(data: bytes, part: Part) -> tuple[Sequence[int], Repeats]:
+    """(rows of chunks with different bytes, and for each of these the rows that repeat it)."""
+    chunks = part.chunks
+    every = range(chunks.rows)
+    if part.tiled or part.subsampled or part.compression == "none":
+        return every, {}
+    if part.decoded_bytes < _WORTH_COMPARING * chunks.rows:
+        return every, {}
+    whole = part.shape[0] // chunks.height  # the last may have fewer scanlines than the others
+    view = memoryview(data)
+    places = chunks.places(view, 0, whole)
+    # most differ in their sizes or last bytes (a checksum in ZIP): only the rest is compared whole
+    ends = [(size, data[max(at, at + size - 8) : at + size]) for at, size in places]
+    counts = Counter(ends)
+    if len(counts) == whole:
+        return every, {}
+    first: dict[memoryview, int] = {}  # of the bytes, none of which is copied
+    repeats: dict[int, list[int]] = {}
+    rows: list[int] = []
+    for row, (at, size) in enumerate(places):
+        source = first.setdefault(view[at : at + size], row) if counts[ends[row]] > 1 else row
+        if source == row:
+            rows.append(row)
+        else:
+            repeats.setdefault(source, []).append(row)
+    return [*rows, *every[whole:]], repeats
+
+
+def _strips(part: Part, rows: Sequence[int], count: int) -> list[Sequence[int]]:
+    """`count` runs of these rows of chunks, if there are as many and they can be cut."""
+    # subsampled lines must not be counted from the top of a strip
+    count = 1 if part.subsampled else min(count, len(rows))
+    bounds = [len(rows) * k // count for k in range(count + 1)]
+    return [rows[first:last] for first, last in itertools.pairwise(bounds)]
+
+
+def _runs(rows: Sequence[int]) -> list[range]:
+    """Ascending rows as runs of consecutive ones."""
+    if isinstance(rows, range):
+        return [rows]
+    runs: list[range] = []
+    for row in rows:
+        if runs and runs[-1].stop == row:
+            runs[-1] = range(runs[-1].start, row + 1)
+        else:
+            runs.append(range(row, row + 1))
+    return runs
+
+
+def _decode(data: bytes, wanted: Wanted, rows: Sequence[int], repeats: Repeats) -> None:
+    """Fills these rows of chunks, and all that repeat one of them."""
+    chunks = wanted.part.chunks
+    runs = [chunks.lines_of(run.start, run.stop) for run in _runs(rows)]
+    height = sum(lines.stop - lines.start for lines in runs)
+    copies = [
+        (chunks.lines_of(row, row + 1), chunks.lines_of(run.start, run.stop))
+        for row in rows
+        if row in repeats
+        for run in _runs(repeats[row])
+    ]
+    stored = _uncompressed(data, wanted, rows[0], rows[-1] + 1)
+    if stored is None:
+        stored = _by_library(chunks.cut(memoryview(data), rows))
+    for name, plane in wanted.planes.items():
+        pixels = stored.get(name)
+        if pixels is None or pixels.shape != (height, plane.shape[1]):
+            raise DamagedImageError(f"the image is damaged: channel '{name}' is incomplete")
+        top = 0
+        for lines in runs:
+            bottom = top + lines.stop - lines.start
+            if not _convert(pixels[top:bottom], plane[lines]):
+                wanted.nonfinite.add(name)
+            top = bottom
+        for source, target in copies:
+            each = plane[source]
+            np.copyto(plane[target].reshape(-1, *each.shape), each)
+
+
+def _by_library(data: bytes) -> dict[str, NDArray[Any]]:
+    """All the channels of a single-part file, by the OpenEXR library."""
+    try:
+        # no threads of the library's own: those here decode other strips
+        with OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0) as file:
+            found = file.parts[0].channels
+            return {name: channel.pixels for name, channel in found.items()}
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise DamagedImageError(
+            f"the image is damaged: {_reason(error)}", fix="save or send the file again"
+        ) from error
+
+
+def _uncompressed(
+    data: bytes, wanted: Wanted, first: int, last: int
+) -> dict[str, NDArray[Any]] | None:
+    """The wanted channels as they lie in the bytes; None unless they lie there row after row."""
+    part, chunks = wanted.part, wanted.part.chunks
+    if part.compression != "none" or part.tiled or part.subsampled:
+        return None
+    if list(part.channels) != sorted(part.channels):  # the library sorts them
+        return None
+    width, count = part.shape[1], last - first
+    types = {name: _TYPES[kind] for name, kind in part.channels.items()}
+    head = 8 if chunks.number is None else 12
+    size = width * sum(kind.itemsize for kind in types.values())
+    table = chunks.table(memoryview(data))[first:last].astype(np.int64)
+    if not (table == table[0] + (head + size) * np.arange(count)).all():
+        return None
+    rows = np.frombuffer(data, np.uint8, count * (head + size), int(table[0]))
+    rows = rows.reshape(count, head + size)
+    if not (np.ascontiguousarray(rows[:, head - 4 : head]).view("<i4") == size).all():
+        return None
+    stored: dict[str, NDArray[Any]] = {}
+    at = head
+    for name, kind in types.items():
+        end = at + width * kind.itemsize
+        if name in wanted.planes:
+            stored[name] = np.ascontiguousarray(rows[:, at:end]).view(kind)
+        at = end
+    return stored
+
+
+def _convert(stored: NDArray[Any], plane: Pixels) -> bool:
+    """Writes stored pixels of any type to `plane`; whether they are finite."""
+    if stored.dtype == np.float16:
+        return floats.to_float(stored, plane)
+    np.copyto(plane, stored, casting="unsafe")
+    return stored.dtype != np.float32 or floats.is_finite(plane)
+
+
+def _reason(error: Exception) -> str:
+    text = str(error).replace('"<python_buffer>"', "").strip()
+    return text.splitlines()[0][:200] if text else type(error).__name__

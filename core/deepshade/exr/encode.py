@@ -1,0 +1,187 @@
+"""Encodes single-part scanline EXR files, compressed with ZIP: chunks on several threads.
+
+The OpenEXR library writes all kinds of files; this writes the commonest kind several times faster.
+Layout: "OpenEXR File Layout", openexr.com/en/latest/OpenEXRFileLayout.html.
+"""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from isal import isal_zlib
+from numpy.typing import NDArray
+
+from deepshade import floats
+from deepshade.exr.chunks import LONG_NAMES, MAGIC, Window
+from deepshade.threads import run_all, thread_count
+
+# name -> (code, scanlines in one chunk)
+COMPRESSIONS = {"zips": (2, 1), "zip": (3, 16)}
+
+_LEVEL = 1  # the higher ones are slower and hardly smaller
+
+# Bytes before compression that a thread encodes at a time: few and large, for between two steps
+# the threads wait for each other; but only a few of them are in memory beside the output.
+_MOST = 2**20
+_LEAST = 2**17
+
+_MOST_NAME = 255  # bytes
+_SHORT_NAME = 31
+_MOST_CHUNK = 2**31 - 1
+_HALF, _FLOAT = 1, 2  # pixel types
+
+_REQUIRED: dict[str, Any] = {  # unless the caller has others of the same type
+    "pixelAspectRatio": 1.0,
+    "screenWindowCenter": np.zeros(2, np.float32),
+    "screenWindowWidth": 1.0,
+}
+_ARRAYS = {
+    ("i", (2,)): "v2i",
+    ("i", (3,)): "v3i",
+    ("f", (2,)): "v2f",
+    ("f", (3,)): "v3f",
+    ("f", (3, 3)): "m33f",
+    ("f", (4, 4)): "m44f",
+}
+
+
+def encode(
+    channels: Mapping[str, NDArray[Any]],
+    half: Collection[str],
+    data_window: Window,
+    display_window: Window,
+    compression: str,
+    attributes: Mapping[str, Any],
+) -> list[bytes]:
+    """The file, as consecutive pieces of its bytes.
+
+    `channels` are (H, W) arrays of numbers, of the size of `data_window`; those in `half` are
+    stored in 16 bits, the others in 32. `compression` is one of `COMPRESSIONS`. `attributes` are
+    int, float, str, and arrays that are int32 (2,) or (3,), or float32 (2,), (3,), (3, 3) or
+    (4, 4). Raises ValueError for names or attributes that no such file can hold.
+    """
+    code, lines = COMPRESSIONS[compression]
+    planes = [(name in half, channels[name]) for name in sorted(channels)]
+    height, width = planes[0][1].shape
+    line_bytes = width * sum(2 if is_half else 4 for is_half, _ in planes)
+    if lines * line_bytes > _MOST_CHUNK:
+        raise ValueError(f"{lines} scanlines of {line_bytes:,} bytes are too much for a chunk")
+    structure = {
+        "channels": ("chlist", _channel_list({name: name in half for name in sorted(channels)})),
+        "compression": ("compression", bytes([code])),
+        "dataWindow": ("box2i", struct.pack("<4i", *data_window)),
+        "displayWindow": ("box2i", struct.pack("<4i", *display_window)),
+        "lineOrder": ("lineOrder", b"\0"),
+        "type": ("string", b"scanlineimage"),
+    }
+    header = _header(structure, attributes, channels)
+    threads = thread_count()
+    piece = min(_MOST, max(_LEAST, -(-height * line_bytes // threads)))
+    strip = lines * -(-piece // (lines * line_bytes))
+    starts = range(0, height, strip)
+    encoded: list[list[bytes]] = [[]] * len(starts)
+
+    def work(index: int) -> None:
+        rows = slice(starts[index], min(starts[index] + strip, height))
+        bodies = _strip([(is_half, plane[rows]) for is_half, plane in planes], lines)
+        first = data_window[1] + rows.start
+        encoded[index] = [
+            struct.pack("<2i", first + lines * n, len(body)) + body for n, body in enumerate(bodies)
+        ]
+
+    run_all(work, range(len(starts)), threads)
+    chunks = list(itertools.chain.from_iterable(encoded))
+    begin = len(header) + 8 * len(chunks)
+    table = np.cumsum([begin, *(len(chunk) for chunk in chunks[:-1])], dtype="<u8")
+    return [header, table.tobytes(), *chunks]
+
+
+def _strip(planes: list[tuple[bool, NDArray[Any]]], lines: int) -> list[bytes]:
+    """The chunks of some scanlines, `lines` in each but the last, which may have fewer."""
+    stored = [
+        floats.to_half(plane) if is_half else np.ascontiguousarray(plane, np.float32)
+        for is_half, plane in planes
+    ]
+    views = [array.view(np.uint8) for array in stored]
+    raw = views[0] if len(views) == 1 else np.concatenate(views, axis=1)
+    whole = len(raw) // lines
+    bodies = _chunks(raw[: whole * lines].reshape(whole, -1)) if whole else []
+    if len(raw) > whole * lines:
+        bodies += _chunks(raw[whole * lines :].reshape(1, -1))
+    return bodies
+
+
+def _chunks(raw: NDArray[np.uint8]) -> list[bytes]:
+    """(chunks, bytes of each), compressed; those that don't become smaller as they are."""
+    # the low bytes of all 16-bit words, then the high ones: like stands by like
+    words = raw.view("<u2")
+    split = np.empty_like(raw)
+    split[:, : words.shape[1]] = words
+    split[:, words.shape[1] :] = words >> np.uint16(8)
+    steps = split.copy()  # each byte's difference to the one before, plus 128
+    steps[:, 1:] -= split[:, :-1]
+    steps[:, 1:] += np.uint8(128)
+    bodies = []
+    for row, step in zip(raw, steps, strict=True):
+        body = isal_zlib.compress(step, _LEVEL)
+        bodies.append(body if len(body) < row.size else row.tobytes())
+    return bodies
+
+
+def _header(
+    structure: Mapping[str, tuple[str, bytes]],
+    attributes: Mapping[str, Any],
+    channels: Iterable[str],
+) -> bytes:
+    """All that comes before the chunk table; `structure` holds (type, value)."""
+    values = {name: _value(value) for name, value in {**_REQUIRED, **attributes}.items()}
+    for name, default in _REQUIRED.items():
+        if values[name][0] != (kind := _value(default)[0]):
+            raise ValueError(f"the header attribute '{name}' must be {kind}, not {values[name][0]}")
+    aspect, width = (
+        {**_REQUIRED, **attributes}[name] for name in ("pixelAspectRatio", "screenWindowWidth")
+    )
+    if not (0 < aspect < float("inf") and 0 <= width < float("inf")):
+        raise ValueError(f"no EXR has a pixel aspect of {aspect} or a screen window {width} wide")
+    for name in ("channels", "lineOrder", "chunkCount"):
+        if name in attributes:
+            raise ValueError(f"the header attribute '{name}' can't be chosen")
+    pieces = []
+    for name, (kind, value) in sorted({**values, **structure}.items()):
+        pieces += [_name(name), _name(kind), struct.pack("<i", len(value)), value]
+    long = any(len(name.encode()) > _SHORT_NAME for name in (*values, *channels))
+    start = struct.pack("<2I", MAGIC, 2 | (LONG_NAMES if long else 0))
+    return b"".join((start, *pieces, b"\0"))
+
+
+def _channel_list(channels: Mapping[str, bool]) -> bytes:
+    """The value of the attribute `channels`; they map names to whether they are half floats."""
+    layout = struct.Struct("<iB3xii")  # pixel type, linear, and every pixel is sampled
+    return b"".join(
+        _name(name) + layout.pack(_HALF if is_half else _FLOAT, 0, 1, 1)
+        for name, is_half in channels.items()
+    ) + bytes(1)
+
+
+def _name(name: str) -> bytes:
+    code = name.encode()
+    if not 0 < len(code) <= _MOST_NAME or 0 in code:
+        raise ValueError(f"no EXR can hold the name {name!r:.60}: 1 to 255 bytes, none of them 0")
+    return code + bytes(1)
+
+
+def _value(value: Any) -> tuple[str, bytes]:
+    """An attribute's type and bytes."""
+    if isinstance(value, int):
+        return "int", struct.pack("<i", value)
+    if isinstance(value, str):
+        return "string", value.encode()
+    if isinstance(value, float):
+        with np.errstate(over="ignore"):
+            return "float", np.float32(value).astype("<f4").tobytes()
+    kind = _ARRAYS[value.dtype.kind, value.shape]
+    return kind, value.astype(value.dtype.newbyteorder("<")).tobytes()

@@ -1,0 +1,264 @@
+"""Reads and writes OpenEXR images; nothing outside this and `exrdecode` knows the library."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import OpenEXR
+from numpy.typing import ArrayLike, NDArray
+
+from deepshade import floats
+from deepshade.errors import ImageError
+from deepshade.exr import encode as exrencode
+from deepshade.exr.decode import Wanted, decode
+from deepshade.exr.header import MAX_COORDINATE, Header, Limits, Part, Window, parse
+from deepshade.files import replacing
+from deepshade.threads import thread_count
+
+__all__ = [
+    "COMPRESSIONS",
+    "Header",
+    "Image",
+    "Limits",
+    "Part",
+    "Window",
+    "fetch",
+    "read",
+    "read_header",
+    "write",
+]
+
+Pixels = NDArray[np.float32]
+
+COMPRESSIONS = {
+    name.removesuffix("_COMPRESSION").lower().replace("no", "none"): member
+    for name, member in OpenEXR.Compression.__members__.items()
+    if name.removesuffix("_COMPRESSION")
+    in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
+}
+
+_THREADED = {"piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256", "htj2k32"}
+_pool_owner = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """Decoded pixels: name in `header.channels()` -> (H, W) float32, C-contiguous.
+
+    `nonfinite` names the channels that hold NaN or infinities.
+    """
+
+    header: Header
+    pixels: dict[str, Pixels]
+    nonfinite: frozenset[str] = frozenset()
+
+    def stack(self, names: Sequence[str]) -> Pixels:
+        """Channels as one (C, H, W) array; no copy when they were read in this order."""
+        planes = [self.pixels[name] for name in names]
+        block = planes[0].base
+        if (
+            isinstance(block, np.ndarray)
+            and block.ndim == 3
+            and block.dtype == np.float32
+            and all(plane.base is block for plane in planes)
+        ):
+            starts = [plane.ctypes.data - block.ctypes.data for plane in planes]
+            step = planes[0].nbytes
+            index = starts[0] // step if step else 0
+            if starts == [(index + k) * step for k in range(len(planes))]:
+                return block[index : index + len(planes)]
+        return np.stack(planes)
+
+
+def read_header(source: Path | str | bytes, limits: Limits | None = None) -> Header:
+    """The checked header of an EXR file or of its bytes; no pixel is decoded.
+
+    Limits, windows, and whether every chunk really lies in the file are checked here.
+    Raises ImageError, DamagedImageError, LimitError.
+    """
+    limits = limits or Limits()
+    return parse(memoryview(fetch(source, limits)), limits)
+
+
+def read(
+    source: Path | str | bytes,
+    channels: Collection[str] | None = None,
+    limits: Limits | None = None,
+    *,
+    header: Header | None = None,
+) -> Image:
+    """Decodes an EXR file, or its bytes, into float32 (half and uint are converted).
+
+    `channels` selects, and orders in memory, the wanted ones by their `Header.channels()`
+    names; None is all. Parts with none of them are not decoded, and of the others only a strip at
+    a time is ever there with all its channels. `header` is what `read_header` gave for the same
+    bytes, to spare reading it again. Raises ImageError, DamagedImageError, LimitError.
+    """
+    limits = limits or Limits()
+    data = fetch(source, limits)
+    header = header or parse(memoryview(data), limits)
+    places = header.channels()
+    wanted = list(places) if channels is None else list(dict.fromkeys(channels))
+    for name in wanted:
+        if name not in places:
+            raise ImageError(f"there is no channel '{name}'; found: {', '.join(places)}")
+        index, channel = places[name]
+        if channel in header.parts[index].subsampled:
+            raise ImageError(
+                f"channel '{name}' is subsampled (luminance/chroma)",
+                fix="save every channel at full resolution, for example as R G B",
+            )
+    pixels = _allocate([(name, header.parts[places[name][0]].shape) for name in wanted])
+    jobs: dict[int, Wanted] = {}
+    for name in wanted:
+        index, channel = places[name]
+        job = jobs.setdefault(index, Wanted(header.parts[index], {}))
+        job.planes[channel] = pixels[name]
+    decode(data, list(jobs.values()))
+    nonfinite = {name for name in wanted if places[name][1] in jobs[places[name][0]].nonfinite}
+    return Image(header, pixels, frozenset(nonfinite))
+
+
+def write(
+    target: Path | str | BinaryIO,
+    channels: Mapping[str, ArrayLike],
+    *,
+    attributes: Mapping[str, Any] | None = None,
+    compression: str = "zip",
+    half: bool | Collection[str] = False,
+    frame: tuple[int, int] | None = None,
+    origin: tuple[int, int] = (0, 0),
+) -> None:
+    """Writes a single-part scanline EXR.
+
+    `channels` maps names to (H, W) arrays, all of one size. `half` says which of them are
+    stored in 16 bits: all, none, or those named; finite values beyond ±65504 are clamped there
+    rather than turned into infinities. `frame` is the display window's (width, height), the
+    image's own size by default; `origin` is where its first pixel lies in that frame.
+    `attributes` are numbers, strings, 2- or 3-vectors, 3x3 or 4x4 matrices; an integer beyond
+    32 bits is stored as text. A path is replaced atomically: written beside, synced, renamed.
+    Raises ValueError for arrays or settings that no EXR can hold.
+    """
+    if compression not in COMPRESSIONS:
+        raise ValueError(f"unknown compression '{compression}', one of: {', '.join(COMPRESSIONS)}")
+    if not channels:
+        raise ValueError("an image needs at least one channel")
+    planes = {name: _plane(name, plane) for name, plane in channels.items()}
+    shapes = {plane.shape for plane in planes.values()}
+    if len(shapes) != 1:
+        raise ValueError(f"channels differ in size: {sorted(shapes)}")
+    height, width = shapes.pop()
+    halves = {name for name in planes if (half if isinstance(half, bool) else name in half)}
+    data_window = _window("data", *origin, width, height)
+    display_window = _window("display", 0, 0, *(frame or (width, height)))
+    header = {key: _attribute(key, value) for key, value in (attributes or {}).items()}
+
+    def encode(stream: BinaryIO) -> None:
+        if compression in exrencode.COMPRESSIONS:
+            windows = data_window, display_window
+            for piece in exrencode.encode(planes, halves, *windows, compression, header):
+                stream.write(piece)
+            return
+        stored = {name: _encodable(plane, name in halves) for name, plane in planes.items()}
+        settings = header | {
+            "compression": COMPRESSIONS[compression],
+            "type": OpenEXR.scanlineimage,
+            "dataWindow": _corners(data_window),
+            "displayWindow": _corners(display_window),
+        }
+        with OpenEXR.File(settings, stored, num_threads=_threads(compression)) as file:
+            file.write(stream)
+
+    if isinstance(target, (str, os.PathLike)):
+        with replacing(Path(target)) as temporary, temporary.open("wb") as stream:
+            encode(stream)
+    else:
+        encode(target)
+
+
+def fetch(source: Path | str | bytes, limits: Limits) -> bytes:
+    """The bytes of a file, or `source` itself. Raises ImageError, LimitError.
+
+    Read once, so that what was checked is what gets decoded; not mapped, because a mapped file
+    that someone truncates meanwhile kills the process.
+    """
+    if isinstance(source, (bytes, bytearray, memoryview)):
+        return bytes(source)  # no copy of what is bytes already
+    path = Path(source)
+    try:
+        limits.check("body_bytes", path.stat().st_size)
+        return path.read_bytes()
+    except OSError as error:
+        raise ImageError(f"can't read {path}: {error.strerror}") from error
+
+
+def _allocate(shapes: Sequence[tuple[str, tuple[int, int]]]) -> dict[str, Pixels]:
+    """Named planes; those of one shape lie one after the other in memory, in this order."""
+    counts = Counter(shape for _, shape in shapes)
+    blocks = {shape: iter(np.empty((n, *shape), np.float32)) for shape, n in counts.items()}
+    return {name: next(blocks[shape]) for name, shape in shapes}
+
+
+def _plane(name: str, plane: ArrayLike) -> NDArray[Any]:
+    array = np.asarray(plane)
+    if array.ndim != 2 or array.size == 0:
+        raise ValueError(f"channel '{name}' has shape {array.shape}, it must be (height, width)")
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"channel '{name}' holds {array.dtype}, not numbers")
+    return array
+
+
+def _encodable(plane: NDArray[Any], half: bool) -> NDArray[Any]:
+    """What the library is given; strided arrays it writes wrongly without an error (issue 1929)."""
+    return floats.to_half(plane) if half else np.ascontiguousarray(plane, np.float32)
+
+
+def _attribute(key: str, value: Any) -> Any:
+    if isinstance(value, (bool, np.bool_)):
+        return int(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value) if -(2**31) <= value < 2**31 else str(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value)
+    if isinstance(value, str):
+        return value
+    if isinstance(value, (np.ndarray, Sequence)) and not isinstance(value, bytes):
+        array = np.asarray(value)
+        if array.shape in ((2,), (3,), (3, 3), (4, 4)) and array.dtype.kind in "iuf":
+            whole = array.dtype.kind in "iu" and array.ndim == 1
+            return np.ascontiguousarray(array, np.int32 if whole else np.float32)
+    raise ValueError(f"the header attribute '{key}' can't hold {value!r:.60}")
+
+
+def _window(name: str, x0: int, y0: int, width: int, height: int) -> Window:
+    window = int(x0), int(y0), int(x0 + width - 1), int(y0 + height - 1)
+    if width < 1 or height < 1 or max(map(abs, window)) > MAX_COORDINATE:
+        raise ValueError(f"no EXR can hold the {name} window {window} (x0, y0, x1, y1)")
+    return window
+
+
+def _corners(window: Window) -> tuple[Any, Any]:
+    return np.array(window[:2], np.int32), np.array(window[2:], np.int32)
+
+
+def _threads(compression: str) -> int:
+    """How many threads the library may use to write a file; starts its pool on first use.
+
+    Only compressions that pack many scanlines into a chunk gain; with one scanline a chunk,
+    handing over costs more than encoding. The pool is empty by default, which means serial. A
+    forked child inherits its size but none of its threads, and would wait for them forever: there
+    it is 0.
+    """
+    global _pool_owner
+    if compression not in _THREADED or thread_count() == 1:
+        return 0
+    if _pool_owner == 0:
+        OpenEXR.set_global_thread_count(thread_count())
+        _pool_owner = os.getpid()
+    return thread_count() if _pool_owner == os.getpid() else 0

@@ -1,0 +1,218 @@
+"""The G-buffer: per-pixel attributes of one view, loaded from EXR files of any renderer."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepshade import exr
+from deepshade.attributes import ATTRIBUTES
+from deepshade.camera import Camera
+from deepshade.errors import CameraError, ConfigError, ImageError
+from deepshade.exr import Header, Limits
+from deepshade.gbuffer import background, channels, derivation
+from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
+from deepshade.gbuffer.profiles import QUANTITIES
+
+Source = Path | str | bytes | tuple[str, bytes]
+
+
+@dataclass(slots=True)
+class GBuffer:
+    """Attributes of one view, ready for a network.
+
+    `attributes` maps names to (C, H, W) float32, C-contiguous; every attribute is 0 where
+    `background` (H, W) is true. `nonfinite` counts the pixels that held NaN or infinities (an
+    infinite depth is a renderer's way to say background and doesn't count). `mapped` tells which
+    channels each quantity came from, `decoded` all that were read for that, as (file, channel),
+    and `derived` how the others were computed. The windows, (x0, y0, x1, y1) inclusive, are those
+    of the part that the attributes came from.
+    """
+
+    attributes: dict[str, NDArray[np.float32]]
+    background: NDArray[np.bool_]
+    camera: Camera | None = None
+    nonfinite: int = 0
+    mapped: dict[str, str] = field(default_factory=dict)
+    decoded: tuple[tuple[int, str], ...] = ()
+    derived: dict[str, str] = field(default_factory=dict)
+    header: dict[str, Any] = field(default_factory=dict)
+    data_window: exr.Window = (0, 0, 0, 0)
+    display_window: exr.Window = (0, 0, 0, 0)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        return cast(tuple[int, int], self.background.shape)
+
+
+def load_gbuffer(
+    sources: Source | Sequence[Source],
+    needs: Sequence[str],
+    *,
+    profile: str | None = None,
+    mapping: Mapping[str, str] | None = None,
+    fov: float | None = None,
+    limits: Limits | None = None,
+    headers: Sequence[Header] | None = None,
+) -> GBuffer:
+    """Loads the attributes `needs` from one EXR file, or from several of one view.
+
+    A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
+    (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
+    comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
+    What isn't there is derived (`derivation`), and `GBuffer.derived` says how. `headers` are what
+    `exr.read_header` gave for the same sources, to spare reading them again.
+
+    Raises ImageError, DamagedImageError, LimitError, MissingAttributeError,
+    AmbiguousChannelError, CameraError, ConfigError.
+    """
+    limits = limits or Limits()
+    for name in needs:
+        if name not in ATTRIBUTES:
+            raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called '{name}'")
+    stems, bodies = _fetch(sources, limits)
+    headers = headers or [exr.read_header(body, limits) for body in bodies]
+    _check_together(headers, limits)
+    planned = plan_gbuffer(headers, stems, needs, profile=profile, mapping=mapping, fov=fov)
+    planned.require(needs)
+    steps: dict[str, derivation.Derivation] = {}
+    for name in needs:
+        for step in derivation.plan(name, {*planned.choices, *steps}, planned.met) or ():
+            steps.setdefault(step.target, step)
+
+    used = {*needs, *(need for step in steps.values() for need in step.needs)}
+    choices = chosen(planned, used, mapping or {})
+    part = planned.parts(next(iter(choices.values())))[0]
+    if planned.camera:
+        planned.camera = framed(planned.camera, part)
+    arrays, suspects = _read(bodies, headers, choices, limits)
+    empty, nonfinite = background.remove(arrays, suspects)
+    if steps:
+        empty, more = _derive(steps.values(), planned, arrays, empty)
+        nonfinite += more
+    _check_side(arrays, empty)
+    return GBuffer(
+        attributes={name: arrays[name] for name in needs},
+        background=empty,
+        camera=planned.camera,
+        nonfinite=nonfinite,
+        mapped={name: str(choice) for name, choice in choices.items()},
+        decoded=tuple((c.file, name) for c in choices.values() for name in c.channels),
+        derived={name: planned.how(step) for name, step in steps.items()},
+        header=planned.attributes,
+        data_window=part.data_window,
+        display_window=part.display_window,
+    )
+
+
+def source_name(field: str, filename: str) -> str:
+    """What a form's file is called: its field if that names a quantity, else its file name."""
+    return f"{field}.exr" if field in QUANTITIES else filename
+
+
+def _fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str], list[bytes]]:
+    if isinstance(sources, (str, bytes, Path)) or (
+        isinstance(sources, tuple)
+        and len(sources) == 2
+        and isinstance(sources[0], str)
+        and isinstance(sources[1], bytes)
+    ):
+        sources = [cast(Source, sources)]
+    stems, bodies, total = [], [], 0
+    for source in sources:
+        if isinstance(source, bytes):
+            stems.append("")
+            bodies.append(source)
+        elif isinstance(source, tuple):
+            stems.append(Path(source[0]).stem)
+            bodies.append(source[1])
+        else:
+            stems.append(Path(source).stem)
+            bodies.append(exr.fetch(source, limits))
+        total += len(bodies[-1])
+        limits.check("body_bytes", total)
+    if not bodies:
+        raise ImageError("no image was given", fix="name at least one EXR file")
+    return stems, bodies
+
+
+def _check_together(headers: Sequence[Header], limits: Limits) -> None:
+    limits.check("parts", sum(len(header.parts) for header in headers))
+    limits.check("channels", sum(len(p.channels) for header in headers for p in header.parts))
+    limits.check("decoded_bytes", sum(header.decoded_bytes for header in headers))
+
+
+def _derive(
+    steps: Iterable[derivation.Derivation],
+    plan: Plan,
+    arrays: dict[str, NDArray[np.float32]],
+    empty: NDArray[np.bool_],
+) -> tuple[NDArray[np.bool_], int]:
+    """Adds to `arrays` what the steps give; (the background, by how many pixels it grew)."""
+    source = derivation.Source(arrays, ~empty, plan.camera, plan.matrix, plan.attributes)
+    grown = 0
+    for step in steps:
+        with np.errstate(over="ignore", invalid="ignore"):
+            array = np.ascontiguousarray(step.function(source), np.float32)
+        arrays[step.target] = array
+        # finite input can still overflow float32: that pixel is background too
+        bad = background.nonfinite(array)
+        bad &= source.valid
+        if bad.any():
+            grown += int(np.count_nonzero(bad))
+            source.valid &= ~bad
+        background.clear([array], ~source.valid)
+    if grown:
+        background.clear(arrays.values(), ~source.valid)
+    return ~source.valid, grown
+
+
+def _check_side(arrays: Mapping[str, NDArray[np.float32]], background: NDArray[np.bool_]) -> None:
+    """Raises CameraError when positions lie behind the camera: another renderer's convention."""
+    if "position" not in arrays or arrays["position"][2].max() <= 0:
+        return
+    behind = int(np.count_nonzero(arrays["position"][2] > 0))
+    visible = int(np.count_nonzero(~background))
+    if 2 * behind > visible:
+        raise CameraError(
+            f"{behind} of {visible} positions lie behind the camera, which looks down -z",
+            fix="if they are in world space: --map position_world=<layer>; "
+            "if the renderer's camera looks down +z, name it: --profile renderman",
+        )
+
+
+def _read(
+    bodies: Sequence[bytes],
+    headers: Sequence[Header],
+    choices: Mapping[str, channels.Choice],
+    limits: Limits,
+) -> tuple[dict[str, NDArray[np.float32]], set[str]]:
+    """(the chosen quantities, which of them hold NaN or infinities)."""
+    arrays: dict[str, NDArray[np.float32]] = {}
+    suspects: set[str] = set()
+    for index, (body, header) in enumerate(zip(bodies, headers, strict=True)):
+        mine = {name: choice for name, choice in choices.items() if choice.file == index}
+        if not mine:
+            continue
+        wanted = [channel for choice in mine.values() for channel in choice.channels]
+        image = exr.read(body, wanted, limits, header=header)
+        users = Counter(channel for choice in mine.values() for channel in set(choice.channels))
+        for name, choice in mine.items():
+            array = image.stack(choice.channels)
+            # attributes that share a channel don't share its memory: each has signs of its own
+            if any(users[channel] > 1 for channel in choice.channels):
+                array = array.copy()
+            for plane, sign in zip(array, choice.signs, strict=False):
+                if sign < 0:
+                    np.negative(plane, out=plane)
+            arrays[name] = array
+            if not image.nonfinite.isdisjoint(choice.channels):
+                suspects.add(name)
+    return arrays, suspects

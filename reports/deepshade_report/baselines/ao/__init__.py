@@ -1,0 +1,1 @@
+"""What ambient occlusion is compared with: HBAO, GTAO, denoised ray tracing."""

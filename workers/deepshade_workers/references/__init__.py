@@ -1,0 +1,1 @@
+"""Monte Carlo references: a file for each effect."""

@@ -1,0 +1,146 @@
+"""Opens scenes by name: mesh files, Mitsuba XML, and `procedural:<family>:<seed>`."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepshade.errors import SceneError, nearest
+from deepshade_workers.scenes.mesh import Material, Mesh, merge
+from deepshade_workers.scenes.procedural import FAMILIES, generate
+from deepshade_workers.scenes.scene import Scene
+
+MESH_SUFFIXES = {".obj", ".ply", ".gltf", ".glb", ".stl", ".off"}
+SUFFIXES = MESH_SUFFIXES | {".xml"}
+PROCEDURAL = "procedural"
+
+
+@functools.lru_cache(maxsize=4)
+def open_scene(name: str) -> Scene:
+    """Open a scene file, or make the procedural scene `procedural:<family>:<seed>`.
+
+    Raises:
+        SceneError: there is no such file or family, or it can't be read.
+    """
+    if name.split(":")[0] == PROCEDURAL:
+        family, seed = parse_procedural(name)
+        if seed is None:
+            raise SceneError(f"{name!r} names no seed", fix=f"write {name}:1, say")
+        return Scene.from_mesh(name, generate(family, seed))
+    path = Path(name)
+    if path.suffix.lower() == ".xml" and path.is_file():
+        return Scene.from_xml(path)
+    return Scene.from_mesh(path.stem, load_mesh(path))
+
+
+def parse_procedural(name: str) -> tuple[str, int | None]:
+    """Split `procedural:<family>[:<seed>]`; raises SceneError for an unknown family."""
+    _, family, *rest = [*name.split(":"), ""][:3] if ":" in name else ["", "", ""]
+    if family not in FAMILIES:
+        near = nearest(family, FAMILIES)
+        hint = f"did you mean {near}? " if near else ""
+        raise SceneError(
+            f"no procedural family {family!r}", fix=f"{hint}there are {', '.join(FAMILIES)}"
+        )
+    if not rest or not rest[0]:
+        return family, None
+    if not rest[0].isdigit():
+        raise SceneError(f"the seed in {name!r} must be a whole number, 0 or more")
+    return family, int(rest[0])
+
+
+def load_mesh(path: Path) -> Mesh:
+    """Read every mesh of a file, with its node transforms and materials, into one.
+
+    Normals of the file are kept; where there are none, edges sharper than 40° stay sharp.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise SceneError(f"there is no scene file {path}")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise SceneError(
+            f"{path}: unknown scene format {path.suffix!r}",
+            fix=f"known formats: {', '.join(sorted(SUFFIXES))}",
+        )
+    try:
+        loaded = trimesh.load_scene(path, process=False)
+        meshes = [mesh for node in loaded.graph.nodes_geometry for mesh in _placed(loaded, node)]
+    except Exception as error:  # trimesh raises whatever its many parsers do
+        raise SceneError(f"{path} can't be read: {error}") from error
+    if not any(len(mesh.faces) for mesh in meshes):
+        raise SceneError(f"{path} holds no triangles")
+    return merge(meshes)
+
+
+def _placed(scene: Any, node: str) -> list[Mesh]:
+    """The mesh of a scene graph's node, if it has one, where its transforms put it.
+
+    trimesh can do this itself (`dump`), but then forgets the normals that the file brought.
+    """
+    import trimesh
+
+    matrix, name = scene.graph[node]
+    part = scene.geometry[name]
+    if not isinstance(part, trimesh.Trimesh) or not len(part.faces):
+        return []
+    if abs(np.linalg.det(matrix[:3, :3])) == 0:
+        return []  # squashed flat: some exporters hide things so
+    return [_convert(part).transformed(np.asarray(matrix, np.float64))]
+
+
+def _convert(part: Any) -> Mesh:
+    own = "vertex_normals" in part._cache and len(part.vertex_normals) == len(part.vertices)
+    normals = np.asarray(part.vertex_normals) if own else None
+    vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
+    if normals is None:
+        vertices, faces = _weld(vertices, faces)
+    return Mesh.build(
+        vertices, faces, crease=40, vertex_normals=normals, material=_material(part.visual)
+    )
+
+
+def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Join vertices at the same place, so that normals smooth across texture seams."""
+    unique, index = np.unique(vertices, axis=0, return_inverse=True)
+    return unique, index.reshape(-1)[faces]
+
+
+def _material(visual: Any) -> Material:
+    """Phong terms of a trimesh visual; textures count with their mean colour.
+
+    Metallic-roughness materials become Phong ones: diffuse = base (1 - metallic), specular from
+    0.04 to base, exponent 2/α² - 2 with α = roughness² (Walter et al. 2007, eq. 33's match).
+    """
+    material = getattr(visual, "material", None)
+    if material is None:
+        return Material()
+    base = _mean_colour(getattr(material, "baseColorTexture", None))
+    factor = getattr(material, "baseColorFactor", None)
+    if factor is None and getattr(material, "main_color", None) is not None:
+        factor = material.main_color
+    if factor is not None:
+        scale = 255.0 if np.asarray(factor).dtype.kind in "ui" else 1.0
+        base = base * np.asarray(factor, np.float64)[:3] / scale
+    metallic = _unit(getattr(material, "metallicFactor", None), 0.0)
+    alpha = max(_unit(getattr(material, "roughnessFactor", None), 0.6) ** 2, 0.03)
+    diffuse = np.clip(base * (1 - metallic), 0, 1)
+    specular = np.clip(0.04 * (1 - metallic) + base * metallic, 0, 1)
+    r, g, b = (float(v) for v in diffuse)
+    sr, sg, sb = (float(v) for v in specular)
+    return Material((r, g, b), (sr, sg, sb), float(max(2 / alpha**2 - 2, 1.0)))
+
+
+def _mean_colour(texture: Any) -> np.ndarray:
+    if texture is None:
+        return np.ones(3)
+    srgb = np.asarray(texture.convert("RGB").resize((64, 64)), np.float64) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.asarray(linear.mean((0, 1)))
+
+
+def _unit(value: Any, default: float) -> float:
+    return default if value is None else float(np.clip(value, 0, 1))

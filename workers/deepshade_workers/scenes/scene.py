@@ -1,0 +1,104 @@
+"""A scene ready for ray tracing, and how to open one by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepshade.errors import SceneError
+from deepshade_workers.backend import mitsuba
+from deepshade_workers.scenes.mesh import Floats, Mesh
+
+# A distant sun and a dim sky: what lights a scene that brings no lights of its own.
+SUN_DIRECTION = (-0.45, -0.75, -0.5)
+SUN_IRRADIANCE = 2.5
+SKY_RADIANCE = 0.35
+
+MATERIAL_CHANNELS = {"diffuse": (0, 3), "specular": (3, 6), "gloss": (6, 7), "scatter": (7, 10)}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A Mitsuba scene with its name and bounds (2, 3) in scene units.
+
+    `lit` tells whether the scene brings lights of its own.
+    `points` (n, 3) are places worth looking at, `extent` the size of the region they cover:
+    a town on a wide plain is as large as the town.
+    """
+
+    name: str
+    traced: Any
+    bounds: Floats
+    points: Floats
+    extent: float
+    lit: bool = False
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the bounding box's diagonal, scene units."""
+        return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
+
+    @classmethod
+    def from_mesh(cls, name: str, mesh: Mesh) -> Scene:
+        """Build the acceleration structure of one merged mesh, lit by the default sun and sky."""
+        if not len(mesh.faces):
+            raise SceneError(f"scene {name!r} holds no triangles")
+        mi = mitsuba()
+        shape = _shape(mi, name, mesh)
+        lights = {
+            "sun": {
+                "type": "directional",
+                "direction": list(SUN_DIRECTION),
+                "irradiance": {"type": "rgb", "value": SUN_IRRADIANCE},
+            },
+            "sky": {"type": "constant", "radiance": {"type": "rgb", "value": SKY_RADIANCE}},
+        }
+        used = mesh.vertices[np.unique(mesh.faces)]
+        bounds = np.stack([used.min(0), used.max(0)])
+        traced = mi.load_dict({"type": "scene", "mesh": shape, **lights})
+        # Where the triangles are small there is something to see; large ones are floors.
+        points = mesh.vertices[mesh.faces[:: max(1, len(mesh.faces) // 4096)]].mean(1)
+        return cls(name, traced, bounds, points, _spread(points))
+
+    @classmethod
+    def from_xml(cls, path: Path) -> Scene:
+        """Load a Mitsuba XML scene with its own shapes, materials and lights."""
+        mi = mitsuba()
+        try:
+            traced = mi.load_file(str(path))
+        except RuntimeError as error:
+            raise SceneError(f"Mitsuba could not load {path}: {error}") from error
+        box = traced.bbox()
+        bounds = np.array([box.min, box.max], np.float64).reshape(2, 3)
+        if not np.isfinite(bounds).all() or not traced.shapes():
+            raise SceneError(f"{path} holds no bounded geometry")
+        points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (1024, 3))
+        lit = bool(traced.emitters())
+        return cls(path.stem, traced, bounds, points, _spread(points), lit)
+
+
+def _spread(points: Floats) -> float:
+    """Diagonal of the box that holds the middle 90 % of `points` along each axis."""
+    low, high = np.percentile(points, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _shape(mi: Any, name: str, mesh: Mesh) -> Any:
+    """One Mitsuba mesh: corners are split so that each carries its own normal."""
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3).astype(np.float32)
+    count = len(mesh.faces)
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse"}})
+    shape = mi.Mesh(name, len(corners), count, has_vertex_normals=True, props=props)
+    for channel, (start, stop) in MATERIAL_CHANNELS.items():
+        values = np.ascontiguousarray(mesh.materials[:, start:stop], np.float32)
+        shape.add_attribute(f"face_{channel}", stop - start, values.ravel())
+    params = mi.traverse(shape)
+    params["vertex_positions"] = mi.Float(corners.ravel())
+    params["vertex_normals"] = mi.Float(mesh.normals.astype(np.float32).ravel())
+    params["faces"] = mi.UInt32(np.arange(3 * count, dtype=np.uint32))
+    params.update()
+    return shape
