@@ -6,7 +6,6 @@ import io
 import json
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,19 +111,17 @@ def infer(
 def encode(
     shade: Float, gbuffer: GBuffer, asked: ShadeParameters, facts: Facts, plan: Json
 ) -> tuple[bytes, str]:
-    """The answer's bytes and media type; it has the G-buffer's windows.
+    """The answer's bytes and media type; it lies where the G-buffer lay.
 
-    Its header holds `facts` and, as JSON, the `plan`. The frame starts at (0, 0), whatever the
-    display window's corner was.
+    Its header holds `facts` and, as JSON, the `plan`.
     """
     if asked.format == "png":
         picture = pictures.of_effect(shade, EFFECTS[str(facts["effect"])])
         return pictures.png(picture), "image/png"
     outputs = "Y" if len(shade) == 1 else "RGB"
-    attributes: dict[str, Any] = gbuffer.camera.to_header() if gbuffer.camera else {}
+    attributes = gbuffer.placement()
     attributes |= {f"deepshade:{name}": value for name, value in facts.items()}
     attributes["deepshade:plan"] = json.dumps(plan, separators=(",", ":"))
-    (x0, y0, *_), (left, top, right, bottom) = gbuffer.data_window, gbuffer.display_window
     stream = io.BytesIO()
     exr.write(
         stream,
@@ -132,8 +129,8 @@ def encode(
         attributes=attributes,
         compression=asked.compression,
         half=asked.half,
-        frame=(right - left + 1, bottom - top + 1),
-        origin=(x0 - left, y0 - top),
+        data_window=gbuffer.data_window,
+        display_window=gbuffer.display_window,
     )
     return stream.getvalue(), "image/x-exr"
 

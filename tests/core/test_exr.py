@@ -106,10 +106,13 @@ def test_uint_is_read_as_float():
 
 @pytest.mark.parametrize("origin", [(0, 0), (-7, 3), (500, -500)])
 def test_data_window_and_frame(origin):
-    body = encode({"Y": plane(5, 6)}, origin=origin, frame=(100, 50))
+    data, display = (*origin, origin[0] + 5, origin[1] + 4), (-9, 5, 90, 54)
+    body = encode({"Y": plane(5, 6)}, data_window=data, display_window=display)
     part = exr.read_header(body).parts[0]
-    assert part.data_window == (*origin, origin[0] + 5, origin[1] + 4)
-    assert part.display_window == (0, 0, 99, 49)
+    assert part.data_window == data
+    assert part.display_window == display
+    with OpenEXR.File(io.BytesIO(body)) as file:
+        assert tuple(np.ravel(file.header()["displayWindow"])) == display
     assert part.shape == (5, 6)
     np.testing.assert_array_equal(exr.read(body).pixels["Y"], plane(5, 6))
 
@@ -287,7 +290,6 @@ def patched(name, kind, value, **settings):
         ("dataWindow", "box2i", struct.pack("<4i", 5, 5, 4, 4), DamagedImageError),
         ("dataWindow", "box2i", struct.pack("<4i", 0, 0, 32, 10**6), DamagedImageError),
         ("displayWindow", "box2i", struct.pack("<4i", 0, 0, -1, -1), DamagedImageError),
-        # moved to the origin, as answers are, it would leave what an EXR can hold
         (
             "displayWindow",
             "box2i",
@@ -371,7 +373,7 @@ def by_library(body):
 @pytest.mark.parametrize("compression", exr.COMPRESSIONS)
 def test_strips_give_what_the_whole_gives(compression, small_strips):
     planes = {"a": plane(300, 9), "layer.b": plane(300, 9, 1), "c": plane(300, 9, 2)}
-    body = encode(planes, compression=compression, half=["a", "c"], origin=(-4, -7))
+    body = encode(planes, compression=compression, half=["a", "c"], data_window=(-4, -7, 4, 292))
     image, (expected,) = exr.read(body), by_library(body)
     for name, values in expected.items():
         np.testing.assert_array_equal(image.pixels[name], values)
@@ -481,7 +483,8 @@ def test_repeated_chunks_are_decoded_once(
     lines = {"zip": 16, "piz": 32, "zips": 1}[compression]
     missing = min(missing, lines - 1)  # scanlines of the last band: that one is like no other
     plane = with_repeats(pattern, len(pattern) * lines - missing, lines=lines)
-    body = encode({"Y": plane, "Z": -plane}, half=True, compression=compression, origin=(5, -9))
+    window = 5, -9, 4 + plane.shape[1], len(plane) - 10
+    body = encode({"Y": plane, "Z": -plane}, half=True, compression=compression, data_window=window)
     image = exr.read(body)
     np.testing.assert_array_equal(image.pixels["Y"], plane)
     np.testing.assert_array_equal(image.pixels["Z"], -plane)

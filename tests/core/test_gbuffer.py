@@ -194,7 +194,9 @@ def test_parts_for_attributes(prefixed):
 
 
 def test_a_cut_of_the_frame():
-    cut = encode({"Z": Z[5:25, 7:40]}, origin=(7, 5), frame=(W, H))
+    cut = encode(
+        {"Z": Z[5:25, 7:40]}, data_window=(7, 5, 39, 24), display_window=(0, 0, W - 1, H - 1)
+    )
     position = load_gbuffer(cut, ("position",)).attributes["position"]
     np.testing.assert_allclose(position, P[:, 5:25, 7:40], rtol=1e-5, atol=1e-5)
 
@@ -313,7 +315,7 @@ def test_files_must_cover_the_same_pixels():
     ]
     with pytest.raises(ImageError, match="different pixels"):
         load_gbuffer(sources, NEEDS)
-    shifted = [sources[0], ("position.exr", encode(layer("", P), origin=(1, 0), frame=(W, H)))]
+    shifted = [sources[0], ("position.exr", encode(layer("", P), data_window=(1, 0, W, H - 1)))]
     with pytest.raises(ImageError, match="different pixels"):
         load_gbuffer(shifted, NEEDS)
 

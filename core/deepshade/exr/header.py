@@ -223,8 +223,7 @@ def _checked_window(raw: RawPart, name: str, where: str) -> Window:
     x0, y0, x1, y1 = raw.attributes[name]
     if x1 < x0 or y1 < y0:
         raise DamagedImageError(f"{where}the {name} is empty: ({x0}, {y0}) to ({x1}, {y1})")
-    # half of it, so that both windows can be moved to the origin together
-    if max(map(abs, (x0, y0, x1, y1))) > MAX_COORDINATE // 2:
+    if max(map(abs, (x0, y0, x1, y1))) > MAX_COORDINATE:
         raise DamagedImageError(f"{where}the {name} is absurd: ({x0}, {y0}) to ({x1}, {y1})")
     return x0, y0, x1, y1
 

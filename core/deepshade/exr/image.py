@@ -132,15 +132,15 @@ def write(
     attributes: Mapping[str, Any] | None = None,
     compression: str = "zip",
     half: bool | Collection[str] = False,
-    frame: tuple[int, int] | None = None,
-    origin: tuple[int, int] = (0, 0),
+    data_window: Window | None = None,
+    display_window: Window | None = None,
 ) -> None:
     """Writes a single-part scanline EXR.
 
     `channels` maps names to (H, W) arrays, all of one size. `half` says which of them are
     stored in 16 bits: all, none, or those named; finite values beyond ±65504 are clamped there
-    rather than turned into infinities. `frame` is the display window's (width, height), the
-    image's own size by default; `origin` is where its first pixel lies in that frame.
+    rather than turned into infinities. Windows are (x0, y0, x1, y1), inclusive: where the pixels
+    lie, and the whole frame; each begins at (0, 0) and has the image's size by default.
     `attributes` are numbers, strings, 2- or 3-vectors, 3x3 or 4x4 matrices; an integer beyond
     32 bits is stored as text. A path is replaced atomically: written beside, synced, renamed.
     Raises ValueError for arrays or settings that no EXR can hold.
@@ -155,22 +155,23 @@ def write(
         raise ValueError(f"channels differ in size: {sorted(shapes)}")
     height, width = shapes.pop()
     halves = {name for name in planes if (half if isinstance(half, bool) else name in half)}
-    data_window = _window("data", *origin, width, height)
-    display_window = _window("display", 0, 0, *(frame or (width, height)))
+    data = _checked_window("data", data_window or (0, 0, width - 1, height - 1))
+    display = _checked_window("display", display_window or (0, 0, width - 1, height - 1))
+    if (data[3] - data[1] + 1, data[2] - data[0] + 1) != (height, width):
+        raise ValueError(f"an image of {width} x {height} pixels can't fill the data window {data}")
     header = {key: _attribute(key, value) for key, value in (attributes or {}).items()}
 
     def encode(stream: BinaryIO) -> None:
         if compression in exrencode.COMPRESSIONS:
-            windows = data_window, display_window
-            for piece in exrencode.encode(planes, halves, *windows, compression, header):
+            for piece in exrencode.encode(planes, halves, data, display, compression, header):
                 stream.write(piece)
             return
         stored = {name: _encodable(plane, name in halves) for name, plane in planes.items()}
         settings = header | {
             "compression": COMPRESSIONS[compression],
             "type": OpenEXR.scanlineimage,
-            "dataWindow": _corners(data_window),
-            "displayWindow": _corners(display_window),
+            "dataWindow": _corners(data),
+            "displayWindow": _corners(display),
         }
         with OpenEXR.File(settings, stored, num_threads=_threads(compression)) as file:
             file.write(stream)
@@ -236,11 +237,11 @@ def _attribute(key: str, value: Any) -> Any:
     raise ValueError(f"the header attribute '{key}' can't hold {value!r:.60}")
 
 
-def _window(name: str, x0: int, y0: int, width: int, height: int) -> Window:
-    window = int(x0), int(y0), int(x0 + width - 1), int(y0 + height - 1)
-    if width < 1 or height < 1 or max(map(abs, window)) > MAX_COORDINATE:
+def _checked_window(name: str, window: Window) -> Window:
+    x0, y0, x1, y1 = map(int, window)
+    if x1 < x0 or y1 < y0 or max(map(abs, (x0, y0, x1, y1))) > MAX_COORDINATE:
         raise ValueError(f"no EXR can hold the {name} window {window} (x0, y0, x1, y1)")
-    return window
+    return x0, y0, x1, y1
 
 
 def _corners(window: Window) -> tuple[Any, Any]:
