@@ -15,7 +15,7 @@ from deepshade.errors import CameraError
 Window = tuple[int, int, int, int]
 # attribute -> (shape, least value)
 _PLACING: dict[str, tuple[tuple[int, ...], float | None]] = {
-    "pixelAspectRatio": ((), np.finfo(np.float32).tiny),
+    "pixelAspectRatio": ((), float(np.finfo(np.float32).tiny)),
     "screenWindowCenter": ((2,), None),
     "screenWindowWidth": ((), 0.0),
     "worldToCamera": ((4, 4), None),

@@ -15,10 +15,11 @@ from deepshade.errors import DamagedImageError, ImageError, LimitError
 from deepshade.exr import Limits
 from deepshade.exr import chunks as exrchunks
 from deepshade.exr import decode as exrdecode
+from deepshade.exr import header as exrheader
 from deepshade.threads import thread_count
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "exr"
-LOSSLESS = ("none", "rle", "zips", "zip", "piz")
+LOSSLESS = ("none", "rle", "zips", "zip", "piz", "htj2k256")
 
 
 def plane(height=20, width=33, seed=0):
@@ -72,6 +73,21 @@ def test_round_trip(compression, half):
         assert image.pixels[name].dtype == np.float32
         assert image.pixels[name].flags.c_contiguous
         assert image.header.parts[0].channels[name] == ("half" if is_half else "float")
+
+
+@pytest.mark.parametrize("version", [(3, 4, 13), (3, 3, 99)])
+@pytest.mark.parametrize("code", ["HTJ2K256", "HTJ2K32"])
+def test_htj2k_is_read_only_by_a_library_without_its_bugs(version, code, monkeypatch):
+    header = {"type": OpenEXR.scanlineimage, "compression": getattr(OpenEXR, f"{code}_COMPRESSION")}
+    body = by_openexr([OpenEXR.Part(header, {"Y": plane().astype(np.float16)}, "")])
+    assert exrheader.LIBRARY_VERSION >= (3, 5)
+    for enough in (exrheader.LIBRARY_VERSION, (3, 4, 14), (4, 0, 0)):
+        monkeypatch.setattr(exrheader, "LIBRARY_VERSION", enough)
+        np.testing.assert_array_equal(exr.read(body).pixels["Y"], plane().astype(np.float16))
+    monkeypatch.setattr(exrheader, "LIBRARY_VERSION", version)
+    with pytest.raises(ImageError, match="htj2k.* can't be read safely") as caught:
+        exr.read_header(body)
+    assert "3.4.14" in caught.value.fix
 
 
 @pytest.mark.parametrize("compression", ["pxr24", "b44", "b44a", "dwaa", "dwab"])
@@ -357,8 +373,8 @@ def test_damaged_pixels():
 @pytest.fixture
 def small_strips(monkeypatch):
     """As if images were too large to be decoded at once."""
-    monkeypatch.setattr(exrdecode, "_LEAST", 500)
-    monkeypatch.setattr(exrdecode, "_MOST", 1000)
+    monkeypatch.setattr(exrdecode, "MIN_STRIP", 500)
+    monkeypatch.setattr(exrdecode, "MAX_STRIP", 1000)
 
 
 def by_library(body):
@@ -418,7 +434,7 @@ def test_parts_without_wanted_channels_are_not_decoded():
 
 
 def test_unwanted_channels_are_there_only_strip_by_strip(monkeypatch):
-    monkeypatch.setattr(exrdecode, "_MOST", 2**20)
+    monkeypatch.setattr(exrdecode, "MAX_STRIP", 2**20)
     size = 512 * 512 * 4
     body = encode({f"c{n:02}": plane(512, 512) for n in range(24)}, compression="none", half=True)
     for compressed in (body, encode(exr.read(body).pixels, compression="zip", half=True)):
@@ -477,9 +493,8 @@ def with_repeats(pattern, height, width=300, lines=16):
 def test_repeated_chunks_are_decoded_once(
     pattern, missing, compression, strip, decoded, monkeypatch
 ):
-    monkeypatch.setattr(exrdecode, "_WORTH_COMPARING", 0)
-    monkeypatch.setattr(exrdecode, "_LEAST", strip)
-    monkeypatch.setattr(exrdecode, "_MOST", strip)
+    monkeypatch.setattr(exrdecode, "MIN_STRIP", strip)
+    monkeypatch.setattr(exrdecode, "MAX_STRIP", strip)
     lines = {"zip": 16, "piz": 32, "zips": 1}[compression]
     missing = min(missing, lines - 1)  # scanlines of the last band: that one is like no other
     plane = with_repeats(pattern, len(pattern) * lines - missing, lines=lines)

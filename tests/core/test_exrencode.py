@@ -57,8 +57,8 @@ def images(draw):
 def test_the_library_reads_what_we_write(image, compression, top, strip):
     planes, half = image
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(exrencode, "_LEAST", strip)
-        patch.setattr(exrencode, "_MOST", strip)
+        patch.setattr(exrencode, "MIN_STRIP", strip)
+        patch.setattr(exrencode, "MAX_STRIP", strip)
         height, width = next(iter(planes.values())).shape
         window = 3, top, 2 + width, top + height - 1
         body = encode(planes, half=half, compression=compression, data_window=window)
@@ -181,7 +181,7 @@ def test_all_kinds_of_numbers(dtype):
 
 
 def test_memory_is_the_output_and_some_strips(monkeypatch):
-    monkeypatch.setattr(exrencode, "_MOST", 2**17)
+    monkeypatch.setattr(exrencode, "MAX_STRIP", 2**17)
     plane = picture("smooth", 2048, 1024).astype(np.float64)
     tracemalloc.start()
     pieces = exrencode.encode({"Y": plane}, {"Y"}, *[(0, 0, 1023, 2047)] * 2, "zip", {})

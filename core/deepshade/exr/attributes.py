@@ -17,8 +17,8 @@ from deepshade.exr.limits import Limits
 
 Buffer = memoryview
 
-MOST_ATTRIBUTES = 4_000  # of all parts; the busiest production files have a few hundred
-_MOST_TEXTS = 4_000  # in one attribute
+MAX_ATTRIBUTES = 4_000  # of all parts; the busiest production files have a few hundred
+MAX_TEXTS = 4_000  # in one attribute
 _TYPES = ("uint", "half", "float")
 
 
@@ -105,7 +105,7 @@ def read_part(cursor: Cursor, limits: Limits, most: int) -> RawPart:
                     f"the header attribute '{name}' is no valid {kind}"
                 ) from None
     raise ImageError(
-        f"the header has over {MOST_ATTRIBUTES:,} attributes", fix="save it without metadata"
+        f"the header has over {MAX_ATTRIBUTES:,} attributes", fix="save it without metadata"
     )
 
 
@@ -141,7 +141,7 @@ def _texts(value: Buffer) -> list[str]:
     cursor = Cursor(value, 0)
     out: list[str] = []
     while cursor.at < len(value):
-        if len(out) == _MOST_TEXTS:
+        if len(out) == MAX_TEXTS:
             raise ValueError
         (size,) = cursor.unpack("<i")
         start = cursor.skip(size)

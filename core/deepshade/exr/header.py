@@ -9,20 +9,23 @@ openexr.com/en/latest/OpenEXRFileLayout.html.
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import OpenEXR
 
 from deepshade.errors import DamagedImageError, ImageError
 from deepshade.exr import chunks as exrchunks
-from deepshade.exr.attributes import MOST_ATTRIBUTES, Buffer, Cursor, RawPart, read_part
+from deepshade.exr.attributes import MAX_ATTRIBUTES, Buffer, Cursor, RawPart, read_part
 from deepshade.exr.chunks import DEEP, LONG_NAMES, MAGIC, MULTIPART, TILED, Chunks, Window
 from deepshade.exr.limits import Limits
 
-__all__ = ["Header", "Limits", "Part", "Window", "parse"]
+LIBRARY_VERSION = tuple(int(number) for number in re.findall(r"\d+", OpenEXR.OPENEXR_VERSION)[:3])
+MIN_HTJ2K_VERSION = (3, 4, 14)  # its decoder had known bugs before
 
 MAX_COORDINATE = 2**30 - 2  # OpenEXR's own bound on windows
 _MAX_TILE = 2**16
@@ -122,8 +125,8 @@ def parse(data: Buffer, limits: Limits) -> Header:
     if flags & DEEP:
         raise _deep()
     multipart = bool(flags & MULTIPART)
-    raws = [read_part(cursor, limits, MOST_ATTRIBUTES)]
-    left = MOST_ATTRIBUTES - len(raws[0].types)
+    raws = [read_part(cursor, limits, MAX_ATTRIBUTES)]
+    left = MAX_ATTRIBUTES - len(raws[0].types)
     while multipart and cursor.peek() != 0:
         limits.check("parts", len(raws) + 1)
         raws.append(read_part(cursor, limits, left))
@@ -176,6 +179,12 @@ def _check_part(raw: RawPart, cursor: Cursor, flags: int, index: int, limits: Li
             f"{where}compression number {code} is unknown here", fix="save it with ZIP compression"
         )
     compression, lines = _COMPRESSIONS[code]
+    if compression.startswith("htj2k") and LIBRARY_VERSION < MIN_HTJ2K_VERSION:
+        raise ImageError(
+            f"{where}{compression} compression can't be read safely by the OpenEXR library here, "
+            f"{'.'.join(map(str, LIBRARY_VERSION))}",
+            fix="save it with ZIP compression, or install OpenEXR 3.4.14 or newer",
+        )
     if tiled:
         if raw.types.get("tiles") != "tiledesc":
             raise DamagedImageError(f"{where}a tiled part without a tile description")

@@ -1,4 +1,4 @@
-"""Reads and writes OpenEXR images; nothing outside this and `exrdecode` knows the library."""
+"""Reads and writes OpenEXR images; nothing outside this and `decode` knows the library."""
 
 from __future__ import annotations
 
@@ -16,35 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 from deepshade import floats
 from deepshade.errors import ImageError
 from deepshade.exr import encode as exrencode
+from deepshade.exr.chunks import Window
 from deepshade.exr.decode import Wanted, decode
-from deepshade.exr.header import MAX_COORDINATE, Header, Limits, Part, Window, parse
+from deepshade.exr.header import MAX_COORDINATE, Header, parse
+from deepshade.exr.limits import Limits
 from deepshade.files import replacing
 from deepshade.threads import thread_count
 
-__all__ = [
-    "COMPRESSIONS",
-    "Header",
-    "Image",
-    "Limits",
-    "Part",
-    "Window",
-    "fetch",
-    "read",
-    "read_header",
-    "write",
-]
-
 Pixels = NDArray[np.float32]
 
+_NAMES = ("none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256")
 COMPRESSIONS = {
-    name.removesuffix("_COMPRESSION").lower().replace("no", "none"): member
-    for name, member in OpenEXR.Compression.__members__.items()
-    if name.removesuffix("_COMPRESSION")
-    in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
+    name: getattr(OpenEXR, f"{name.replace('none', 'no').upper()}_COMPRESSION") for name in _NAMES
 }
 
-_THREADED = {"piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256", "htj2k32"}
-_pool_owner = 0
+_pool_owner = 0  # the process that started the library's threads
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +159,7 @@ def write(
             "dataWindow": _corners(data),
             "displayWindow": _corners(display),
         }
-        with OpenEXR.File(settings, stored, num_threads=_threads(compression)) as file:
+        with OpenEXR.File(settings, stored, num_threads=_library_threads()) as file:
             file.write(stream)
 
     if isinstance(target, (str, os.PathLike)):
@@ -248,17 +234,13 @@ def _corners(window: Window) -> tuple[Any, Any]:
     return np.array(window[:2], np.int32), np.array(window[2:], np.int32)
 
 
-def _threads(compression: str) -> int:
+def _library_threads() -> int:
     """How many threads the library may use to write a file; starts its pool on first use.
 
-    Only compressions that pack many scanlines into a chunk gain; with one scanline a chunk,
-    handing over costs more than encoding. The pool is empty by default, which means serial. A
-    forked child inherits its size but none of its threads, and would wait for them forever: there
-    it is 0.
+    The pool is empty by default, which means serial. A forked child inherits its size but none of
+    its threads, and would wait for them forever: there it is 0.
     """
     global _pool_owner
-    if compression not in _THREADED or thread_count() == 1:
-        return 0
     if _pool_owner == 0:
         OpenEXR.set_global_thread_count(thread_count())
         _pool_owner = os.getpid()
