@@ -85,7 +85,7 @@ def test_htj2k_is_read_only_by_a_library_without_its_bugs(version, code, monkeyp
         monkeypatch.setattr(exrheader, "LIBRARY_VERSION", enough)
         np.testing.assert_array_equal(exr.read(body).pixels["Y"], plane().astype(np.float16))
     monkeypatch.setattr(exrheader, "LIBRARY_VERSION", version)
-    with pytest.raises(ImageError, match="htj2k.* can't be read safely") as caught:
+    with pytest.raises(ImageError, match=r"htj2k.* can't be read safely") as caught:
         exr.read_header(body)
     assert "3.4.14" in caught.value.fix
 
