@@ -1,4 +1,4 @@
-"""`deepshade doctor`: is everything there, and if not, the line that puts it right."""
+"""`deepshade doctor`: checks of this machine, each with the line that puts it right."""
 
 from __future__ import annotations
 
@@ -14,19 +14,12 @@ from typing import Annotated
 import typer
 
 from deepshade.errors import BundleError
-from deepshade.extras import EXTRAS, installed, missing_packages
+from deepshade.extras import installed, missing_packages, packages
 from deepshade.llvm import FIX as LLVM_FIX
 from deepshade.llvm import find_libllvm, libllvm_version
 from deepshade.machine import cpu_count, cpu_quota, memory_bytes
 
 _GIB = 1024**3
-_CORE = (
-    ("numpy", "numpy"),
-    ("OpenEXR", "OpenEXR"),
-    ("isal", "isal"),
-    ("typer", "typer"),
-    ("rich", "rich"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,27 +62,13 @@ def check_python() -> list[Check]:
 
 def check_packages() -> list[Check]:
     """The core's packages, which are required, and each extra's, which aren't."""
-    lacking = [package for module, package in _CORE if not installed(module)]
-    checks = [
-        Check(
-            "core packages",
-            not lacking,
-            True,
-            f"missing: {', '.join(lacking)}" if lacking else "all installed",
-            "pip install deepshade" if lacking else "",
-        )
-    ]
-    for extra in EXTRAS:
+    checks = []
+    for extra in packages():
         lacking = missing_packages(extra)
-        checks.append(
-            Check(
-                f"extra '{extra}'",
-                not lacking,
-                False,
-                f"missing: {', '.join(lacking)}" if lacking else "all installed",
-                f"pip install 'deepshade[{extra}]'" if lacking else "",
-            )
-        )
+        name = f"extra '{extra}'" if extra else "core packages"
+        detail = f"missing: {', '.join(lacking)}" if lacking else "all installed"
+        fix = f"pip install 'deepshade[{extra}]'" if extra else "pip install deepshade"
+        checks.append(Check(name, not lacking, not extra, detail, fix if lacking else ""))
     return checks
 
 
