@@ -1,4 +1,4 @@
-"""What the service sends back."""
+"""Shaded pictures as the service sends them, in memory or saved."""
 
 from __future__ import annotations
 

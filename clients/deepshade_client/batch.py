@@ -52,7 +52,7 @@ def views(inputs: Sequence[str], *, together: bool = False) -> list[tuple[Path, 
 
 
 def together_or_one(sources: tuple[Path, ...]) -> Path | tuple[Path, ...]:
-    """What the client takes as a picture: several files of a view, or its only one."""
+    """A view as the client's picture argument: its only file, or the tuple of all."""
     return sources if len(sources) > 1 else sources[0]
 
 

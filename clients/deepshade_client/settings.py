@@ -17,7 +17,7 @@ from deepshade_client.exceptions import (
 )
 
 _WORTH_RETRYING = (ConnectionFailed, ConnectionBroken, Busy, NotReady)
-MAX_ASKED = 300.0  # seconds; the service asks for a minute at most, a proxy might for a day
+MAX_RETRY_AFTER = 300.0  # seconds; the service asks for a minute at most, a proxy may for a day
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
@@ -65,7 +65,7 @@ class Retry:
             return None
         own = self.first * 2.0 ** (attempt - 1) * random.uniform(1.0, 1.25)
         asked = getattr(error, "retry_after", None) or 0.0
-        return max(min(self.longest, own), min(asked, MAX_ASKED))
+        return max(min(self.longest, own), min(asked, MAX_RETRY_AFTER))
 
 
 NO_RETRY = Retry(attempts=1)

@@ -54,14 +54,14 @@ def run_checks(checks: Sequence[Callable[[], list[Check]]] | None = None) -> lis
 
 
 def check_python() -> list[Check]:
-    """Python itself."""
+    """Whether Python is new enough."""
     version = ".".join(map(str, sys.version_info[:3]))
     ok = sys.version_info >= (3, 11)
     return [Check("python", ok, True, version, "" if ok else "install Python 3.11 or newer")]
 
 
 def check_packages() -> list[Check]:
-    """The core's packages, which are required, and each extra's, which aren't."""
+    """Whether the core's packages are installed (required) and each extra's (not required)."""
     checks = []
     for extra in packages():
         lacking = missing_packages(extra)
@@ -73,7 +73,7 @@ def check_packages() -> list[Check]:
 
 
 def check_llvm() -> list[Check]:
-    """libLLVM, which Mitsuba needs to render on the CPU; required once Mitsuba is installed."""
+    """Whether libLLVM is found, which Mitsuba renders with; required if Mitsuba is installed."""
     needed = installed("mitsuba")
     path = find_libllvm()
     if path is None:
@@ -88,7 +88,7 @@ def check_llvm() -> list[Check]:
 
 
 def check_shared_memory(path: Path = Path("/dev/shm")) -> list[Check]:
-    """/dev/shm, where Ray's workers exchange arrays."""
+    """How large /dev/shm is, where Ray's workers exchange arrays."""
     if not path.is_dir():
         return [Check("shared memory", True, False, "no /dev/shm on this system")]
     total = shutil.disk_usage(path).total
@@ -97,7 +97,7 @@ def check_shared_memory(path: Path = Path("/dev/shm")) -> list[Check]:
 
 
 def check_machine() -> list[Check]:
-    """CPUs and memory, as far as this process may use them."""
+    """How many CPUs and how much memory this process may use."""
     quota = cpu_quota()
     cpus = f"{cpu_count()} usable of {os.cpu_count()}" + (f", quota {quota:g}" if quota else "")
     memory = memory_bytes()
@@ -131,7 +131,7 @@ def check_engines() -> list[Check]:
 
 
 def check_bundles(root: Path | None = None) -> list[Check]:
-    """The shipped models: each must match its hashes."""
+    """Whether each shipped model matches its hashes."""
     from deepshade.bundles import Bundle, bundle_folders, bundle_root
 
     root = root or bundle_root()
