@@ -53,11 +53,12 @@ def decode(data: bytes, wanted: Sequence[Wanted]) -> None:
         for each, (rows, _) in zip(wanted, distinct, strict=True)
     ]
     piece = min(MAX_STRIP, max(MIN_STRIP, -(-sum(shares) // threads)))
-    strips = [
-        (each, strip, repeats)
-        for each, (rows, repeats), share in zip(wanted, distinct, shares, strict=True)
-        for strip in _strips(each.part, rows, -(-share // piece))
-    ]
+    strips: list[tuple[Wanted, Sequence[int], Repeats]] = []
+    for each, (rows, repeats), share in zip(wanted, distinct, shares, strict=True):
+        # subsampled lines must not be counted from the top of a strip
+        count = 1 if each.part.subsampled else min(-(-share // piece), len(rows))
+        bounds = [len(rows) * k // count for k in range(count + 1)]
+        strips += [(each, rows[a:b], repeats) for a, b in itertools.pairwise(bounds)]
     run_all(lambda strip: _decode(data, *strip), strips, threads)
 
 
@@ -85,14 +86,6 @@ def _distinct(data: bytes, part: Part) -> tuple[Sequence[int], Repeats]:
         else:
             repeats.setdefault(source, []).append(row)
     return [*rows, *every[whole:]], repeats
-
-
-def _strips(part: Part, rows: Sequence[int], count: int) -> list[Sequence[int]]:
-    """These rows of chunks in `count` strips, or fewer where they can't be cut."""
-    # subsampled lines must not be counted from the top of a strip
-    count = 1 if part.subsampled else min(count, len(rows))
-    bounds = [len(rows) * k // count for k in range(count + 1)]
-    return [rows[first:last] for first, last in itertools.pairwise(bounds)]
 
 
 def _runs(rows: Sequence[int]) -> list[range]:

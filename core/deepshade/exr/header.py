@@ -8,6 +8,7 @@ openexr.com/en/latest/OpenEXRFileLayout.html.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import struct
@@ -15,7 +16,6 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import OpenEXR
 
 from deepshade.errors import DamagedImageError, ImageError
@@ -28,7 +28,7 @@ LIBRARY_VERSION = tuple(int(number) for number in re.findall(r"\d+", OpenEXR.OPE
 MIN_HTJ2K_VERSION = (3, 4, 14)  # its decoder had known bugs before
 
 MAX_COORDINATE = 2**30 - 2  # OpenEXR's own bound on windows
-_MAX_TILE = 2**16
+MAX_TILE = 2**16
 _BYTES = {"uint": 4, "half": 2, "float": 4}
 
 # code -> (name, scanlines in one chunk)
@@ -242,26 +242,23 @@ def _tile_count(
 ) -> tuple[int, float]:
     """(number of tiles on all levels, pixels of all levels / of the first)."""
     tile_width, tile_height, mode = tiles
-    if not (1 <= tile_width <= _MAX_TILE and 1 <= tile_height <= _MAX_TILE):
+    if not (1 <= tile_width <= MAX_TILE and 1 <= tile_height <= MAX_TILE):
         raise DamagedImageError(f"{where}absurd tiles of {tile_width} x {tile_height} pixels")
     levels, rounding = mode & 0xF, mode >> 4
     if levels > 2 or rounding > 1:
         raise DamagedImageError(f"{where}unknown tile mode {mode}")
 
-    def sizes(size: int, count: int) -> list[int]:
-        up = (1 << np.arange(count, dtype=np.int64)) - 1 if rounding else 0
-        return [max(1, int(s)) for s in (size + up) >> np.arange(count)]
+    def sizes(size: int) -> list[int]:  # of each level, until 1 pixel is left
+        found = [size]
+        while found[-1] > 1:
+            found.append((found[-1] + rounding) // 2)
+        return found
 
-    def depth(size: int) -> int:  # levels until 1 pixel is left
-        return (math.ceil if rounding else math.floor)(math.log2(size)) + 1
-
+    pairs: list[tuple[int, ...]] = [(width, height)]
     if levels == 1:
-        count = depth(max(width, height))
-        pairs = list(zip(sizes(width, count), sizes(height, count), strict=True))
+        pairs = list(itertools.zip_longest(sizes(width), sizes(height), fillvalue=1))
     elif levels == 2:
-        pairs = [(w, h) for h in sizes(height, depth(height)) for w in sizes(width, depth(width))]
-    else:
-        pairs = [(width, height)]
+        pairs = list(itertools.product(sizes(width), sizes(height)))
     chunks = sum(-(-w // tile_width) * -(-h // tile_height) for w, h in pairs)
     scale = sum(w * h for w, h in pairs) / (width * height)
     return chunks, scale

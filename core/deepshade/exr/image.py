@@ -47,18 +47,12 @@ class Image:
     def stack(self, names: Sequence[str]) -> Pixels:
         """Channels as one (C, H, W) array; no copy when they were read in this order."""
         planes = [self.pixels[name] for name in names]
-        block = planes[0].base
-        if (
-            isinstance(block, np.ndarray)
-            and block.ndim == 3
-            and block.dtype == np.float32
-            and all(plane.base is block for plane in planes)
-        ):
-            starts = [plane.ctypes.data - block.ctypes.data for plane in planes]
-            step = planes[0].nbytes
-            index = starts[0] // step if step else 0
-            if starts == [(index + k) * step for k in range(len(planes))]:
-                return block[index : index + len(planes)]
+        block = planes[0].base  # (n, H, W): all planes of this size, in the order of reading
+        if block is not None and all(plane.base is block for plane in planes):
+            start, size = block.ctypes.data, planes[0].nbytes
+            at = [(plane.ctypes.data - start) // size for plane in planes]
+            if at == list(range(at[0], at[0] + len(at))):
+                return block[at[0] : at[0] + len(at)]
         return np.stack(planes)
 
 
