@@ -48,26 +48,27 @@ def render(
 
     from deepshade.camera import Camera
     from deepshade.errors import ConfigError
+    from deepshade_workers.references import require
     from deepshade_workers.render import render as render_view
     from deepshade_workers.scenes.loading import open_scene
+    from deepshade_workers.view import View
 
     if radius is not None and not (math.isfinite(radius) and radius > 0):
         raise ConfigError("radius", detail=f"the radius must be above 0, not {radius}")
-    names = _known([name.strip() for name in effects.split(",") if name.strip()])
+    names = [name.strip() for name in effects.split(",") if name.strip()]
+    require(names)
+    chosen = _attributes(attributes)
     width, height = _size(size)
     camera = Camera.look_at(eye, target, up, fov, width, height)
     opened = open_scene(scene)
-    figures = render_view(
-        opened,
+    view = View(
         camera,
-        output,
-        effects=names,
         radius=opened.diagonal / 20 if radius is None else radius,
-        samples=spp,
-        seed=seed,
         focus=math.dist(eye, target) if focus is None else focus,
         aperture=aperture,
-        attributes=_attributes(attributes),
+    )
+    figures = render_view(
+        opened, view, output, effects=names, samples=spp, seed=seed, attributes=chosen
     )
     if as_json:
         typer.echo(json.dumps(figures))
@@ -138,12 +139,12 @@ def datagen(
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
-    from deepshade_workers.datagen import Job, expand_scenes, generate, rate
+    from deepshade_workers.datagen import DataSpec, expand_scenes, generate, rate
 
-    job = Job(
+    spec = DataSpec(
         scenes=expand_scenes(scenes),
         views=views,
-        effects=tuple(_known(effects or ["ao"])),
+        effects=tuple(effects or ["ao"]),
         size=size,
         frame=frame or size,
         spp=spp,
@@ -154,7 +155,7 @@ def datagen(
     )
     begun, start, done = time.monotonic(), None, 0
     with _progress(hidden=as_json) as report:
-        for done, total in generate(job, out, address=address):
+        for done, total in generate(spec, out, address=address):
             start = done if start is None else start
             report(done, total)
     fresh = done - (start or 0)
@@ -166,20 +167,6 @@ def datagen(
         "views_per_second": round(rate(fresh, begun), 3),
     }
     typer.echo(json.dumps(summary) if as_json else f"{done} views in {out}, {fresh} of them new")
-
-
-def _known(effects: list[str]) -> list[str]:
-    from deepshade.errors import ConfigError
-    from deepshade_workers.references.ao import REFERENCES
-
-    for effect in effects:
-        if effect not in REFERENCES:
-            raise ConfigError(
-                effect,
-                REFERENCES,
-                detail=f"no reference for {effect!r}; there are: {', '.join(REFERENCES)}",
-            )
-    return effects
 
 
 class _progress:

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from deepshade_workers.scenes.mesh import Floats, Material, Mesh, merge
 from deepshade_workers.scenes.procedural.primitives import Rng, along, box, cylinder, place, sphere
 
+# How many materials scatter light below their surface, and how far it gets (scene units).
+SCATTERING_SHARE = 0.4
+MEAN_FREE_PATHS = (0.005, 0.3)
+
 
 class Assembly:
-    """A growing list of placed meshes with random materials, drawn from `rng`."""
+    """A growing list of placed meshes with random materials, drawn from `rng`.
+
+    What is placed between two coats of paint is one object.
+    """
 
     def __init__(self, rng: Rng) -> None:
         self.rng = rng
+        # A stream of its own: a seed's geometry and other materials don't depend on it.
+        self._scatter_rng = rng.spawn(1)[0]
         self._parts: list[Mesh] = []
-        self.material = self._draw_material()
+        self._names: list[str] = []
+        self._coats = 0
+        self.paint()
 
     def _draw_material(self) -> Material:
         rng = self.rng
@@ -20,16 +33,25 @@ class Assembly:
         shine = rng.uniform(0, 0.3)
         gloss = float(2 ** rng.uniform(1, 8))
         r, g, b = (float(v) for v in diffuse)
-        return Material((r, g, b), (shine, shine, shine), gloss)
+        return Material((r, g, b), (shine, shine, shine), gloss, self._draw_scatter())
+
+    def _draw_scatter(self) -> tuple[float, float, float]:
+        rng = self._scatter_rng
+        scatters = rng.random() < SCATTERING_SHARE
+        farthest = np.exp(rng.uniform(*np.log(MEAN_FREE_PATHS)))
+        r, g, b = (float(v) for v in scatters * farthest * rng.uniform(0.2, 1, 3))
+        return r, g, b
 
     def paint(self) -> None:
-        """Give what follows a new material."""
+        """Begin a new object, of a new material."""
         self.material = self._draw_material()
+        self._coats += 1
 
     def add(self, mesh: Mesh, matrix: Floats | None = None) -> None:
         """Place `mesh` by a (4, 4) `matrix`."""
         placed = mesh if matrix is None else mesh.transformed(matrix)
         self._parts.append(placed.with_material(self.material))
+        self._names.append(f"object {self._coats}")
 
     def box(
         self,
@@ -60,4 +82,4 @@ class Assembly:
 
     def finish(self) -> Mesh:
         """All parts as one mesh."""
-        return merge(self._parts)
+        return merge(self._parts, self._names)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from deepshade_workers.views import RADIUS_RANGE, sample_view
 
 from deepshade.errors import SceneError
 from deepshade_workers.references.ao import ambient_occlusion
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import trace
-from deepshade_workers.views import RADIUS_RANGE, sample_view
 
 from .conftest import quad
 
