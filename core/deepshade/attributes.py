@@ -1,24 +1,62 @@
-"""The per-pixel attributes (the paper's symbols) and their canonical EXR channels, as one table."""
+"""The per-pixel attributes (the paper's symbols), their units and canonical EXR channels.
+
+What an attribute is measured in decides how it is stored, scaled and turned: a row names its
+unit, and nothing else in the project asks for an attribute by name to do one of these.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-Space = Literal["camera", "world", "none"]
-Kind = Literal["point", "vector", "scalar", "colour", "motion"]
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """What numbers mean.
+
+    `storage` is the narrowest type that holds them (half floats end at 65504 and resolve 1/2048).
+    `scaled` lengths are divided by the effect's radius or the picture's depth before a network
+    sees them. `turns` says whether x and y turn with the picture: vectors of camera space (y up)
+    or of the screen (v down).
+    """
+
+    name: str
+    storage: Literal["float16", "float32"] = "float16"
+    scaled: bool = False
+    turns: Literal["camera", "screen"] | None = None
+
+
+LENGTH = Unit("length", "float32", scaled=True)
+POINT = Unit("length", "float32", scaled=True, turns="camera")  # a place: lengths with a direction
+CAMERA_DIRECTION = Unit("direction, camera", turns="camera")
+WORLD_DIRECTION = Unit("direction, world")
+PIXELS = Unit("pixels", "float32")
+SCREEN_MOTION = Unit("pixels", "float32", turns="screen")
+RADIANS = Unit("radians")
+REFLECTANCE = Unit("reflectance")
+EXPONENT = Unit("exponent")
+RADIANCE = Unit("radiance", "float32")
 
 
 @dataclass(frozen=True, slots=True)
 class Attribute:
-    """One per-pixel attribute; `channels` are its canonical EXR names in memory order."""
+    """One per-pixel attribute; `channels` are its canonical EXR names in memory order.
+
+    `in_background` attributes say something where there is no surface too: the sky's light, the
+    direction to the camera, the blur at infinity. All others are 0 there.
+    """
 
     name: str
     symbol: str
     channels: tuple[str, ...]
-    space: Space
-    kind: Kind
+    unit: Unit
     meaning: str
+    in_background: bool = False
+
+    @property
+    def coloured(self) -> bool:
+        """Whether its channels are R, G and B: an effect run once a channel sees one of them."""
+        return len(self.channels) == 3 and self.channels[0].endswith(".R")
 
 
 def _xyz(layer: str) -> tuple[str, ...]:
@@ -29,55 +67,33 @@ def _rgb(layer: str) -> tuple[str, ...]:
     return tuple(f"{layer}.{band}" for band in "RGB")
 
 
-# Camera space: right-handed, +x right, +y up, looking down -z. Lengths in scene units.
+# Camera space: right-handed, +x right, +y up, looking down -z.
 _TABLE = (
-    Attribute("position", "P_s", _xyz("position"), "camera", "point", "camera-space position"),
-    Attribute("normal", "N_s", _xyz("normal"), "camera", "vector", "shading normal, camera space"),
-    Attribute(
-        "normal_world",
-        "N_w",
-        _xyz("normal_world"),
-        "world",
-        "vector",
-        "normal, world space",
-    ),
-    Attribute("depth", "D_s", ("Z",), "none", "scalar", "planar depth, -P_s.z, > 0"),
-    Attribute(
-        "focal",
-        "D_focal",
-        ("focal.V",),
-        "none",
-        "scalar",
-        "signed blur diameter, pixels",
-    ),
-    Attribute("view", "C_w", _xyz("view"), "world", "vector", "unit direction to the camera"),
+    Attribute("position", "P_s", _xyz("position"), POINT, "camera-space position"),
+    Attribute("normal", "N_s", _xyz("normal"), CAMERA_DIRECTION, "shading normal, camera space"),
+    Attribute("normal_world", "N_w", _xyz("normal_world"), WORLD_DIRECTION, "normal, world space"),
+    Attribute("depth", "D_s", ("Z",), LENGTH, "planar depth, -P_s.z, > 0"),
+    Attribute("focal", "D_focal", ("focal.V",), PIXELS, "signed diameter of the blur circle", True),
+    Attribute("view", "C_w", _xyz("view"), WORLD_DIRECTION, "unit direction to the camera", True),
     Attribute(
         "view_angle",
         "C_α",  # noqa: RUF001 - the paper's symbol
         ("view_angle.V",),
-        "none",
-        "scalar",
-        "angle of C_w and N_w, radians",
+        RADIANS,
+        "angle between C_w and N_w",
     ),
-    Attribute("diffuse", "R_diff", _rgb("diffuse"), "none", "colour", "Phong diffuse reflectance"),
-    Attribute(
-        "specular", "R_spec", _rgb("specular"), "none", "colour", "Phong specular reflectance"
-    ),
-    Attribute("gloss", "R_gloss", ("gloss.V",), "none", "scalar", "Phong exponent"),
-    Attribute(
-        "scatter", "R_scatt", _rgb("scatter"), "none", "colour", "mean free path, scene units"
-    ),
-    Attribute("light", "L", _rgb("light"), "none", "colour", "direct light"),
-    Attribute(
-        "light_diffuse", "L_diff", _rgb("light_diffuse"), "none", "colour", "diffuse direct light"
-    ),
+    Attribute("diffuse", "R_diff", _rgb("diffuse"), REFLECTANCE, "Phong diffuse reflectance"),
+    Attribute("specular", "R_spec", _rgb("specular"), REFLECTANCE, "Phong specular reflectance"),
+    Attribute("gloss", "R_gloss", ("gloss.V",), EXPONENT, "Phong exponent"),
+    Attribute("scatter", "R_scatt", _rgb("scatter"), LENGTH, "scattering mean free path"),
+    Attribute("light", "L", _rgb("light"), RADIANCE, "direct light to the eye; the sky's", True),
+    Attribute("light_diffuse", "L_diff", _rgb("light_diffuse"), RADIANCE, "diffuse part of L"),
     Attribute(
         "motion",
         "F",
         ("motion.U", "motion.V"),
-        "none",
-        "motion",
-        "motion during the exposure, pixels, u right, v down",
+        SCREEN_MOTION,
+        "motion while the shutter is open, u right, v down",
     ),
 )
 

@@ -6,7 +6,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -15,35 +15,32 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.errors import BundleError, nearest
 from deepshade.files import replacing, sha256
+from deepshade.tensors import channel_count
 
 MODEL = "model.onnx"
-WEIGHTS = "model.safetensors"
-INT8 = "model.int8.onnx"
-PROBE = "probe.exr"
 CONFIG = "config.json"
 METRICS = "metrics.json"
 
-_MAX_BYTES = {CONFIG: 1 << 20, METRICS: 16 << 20, MODEL: 1 << 30, WEIGHTS: 1 << 30}
-_MAX_BYTES |= {INT8: 1 << 30, PROBE: 64 << 20}
+_MAX_BYTES = {CONFIG: 1 << 20, METRICS: 16 << 20, MODEL: 1 << 30}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_SCALES = ("1/radius", "none")
+_TENSOR = re.compile(r"[ -~]{1,256}")
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
     """A verified bundle. `config.json` holds every field but `path` and `metrics`.
 
-    `inputs` are attribute names in network order; positions reach the graph multiplied by
-    `position_scale` ("1/radius", or "none"). `radius` is the default effect radius in scene
-    units and `fov` the horizontal angle in degrees that it was trained at. Image sides must be
-    multiples of `size_multiple`; pixels within `halo` of a tile's inner side depend on its
-    neighbour. Background farther than `background_halo` from all geometry changes no pixel of
-    it, so it need not be computed (as far as `halo`, unless the configuration says less). `ranges`
-    are the (lowest, highest) values seen in training; `hashes` maps file names to sha256.
+    `inputs` are attribute names in network order, in physical units but for lengths, which are
+    divided as the effect's row says. With `per_channel` the graph sees one colour channel and
+    runs three times. `radius` is the default effect radius in scene units and `fov` the
+    horizontal angle in degrees that it was trained at. Image sides must be multiples of
+    `size_multiple`; pixels within `halo` of a tile's inner side depend on its neighbour.
+    `bytes_per_pixel` is the memory that a prediction takes for each pixel, in float32.
 
-    Two files may be absent: the graph in 8 bits (`INT8`), quantised on real G-buffers, and
-    `PROBE`, a few held-out G-buffers with their reference, on which a machine measures what a
-    precision costs it (see `deepshade.probe`).
+    `float32` names the tensors up to which the graph must be calculated in float32: arithmetic on
+    lengths, which 16 bits would round. `network` is the trainer's configuration of the network,
+    whose weights the graph holds by their own names. `ranges` are the (lowest, highest) values
+    seen in training; `hashes` maps file names to sha256.
     """
 
     path: Path
@@ -55,38 +52,26 @@ class Bundle:
     fov: float
     size_multiple: int
     halo: int
+    bytes_per_pixel: int
+    per_channel: bool = False
+    float32: tuple[str, ...] = ()
+    network: dict[str, Any] = field(default_factory=dict)
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
     hashes: dict[str, str] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
-    version: str = "1"
-    position_scale: str = "1/radius"
+    version: str = "2"
     input_name: str = "gbuffer"
     output_name: str = "shade"
-    background_halo: int = -1
-
-    def __post_init__(self) -> None:
-        if self.background_halo < 0:
-            object.__setattr__(self, "background_halo", self.halo)
 
     @property
     def model(self) -> Path:
-        """The ONNX graph."""
+        """The ONNX graph, weights included."""
         return self.path / MODEL
 
     @property
-    def weights(self) -> Path:
-        """The same weights for further training."""
-        return self.path / WEIGHTS
-
-    @property
-    def int8(self) -> Path | None:
-        """The ONNX graph in 8 bits, None without one."""
-        return self.path / INT8 if INT8 in self.hashes else None
-
-    @property
-    def probe(self) -> Path | None:
-        """Held-out G-buffers with their reference, None without them."""
-        return self.path / PROBE if PROBE in self.hashes else None
+    def channels(self) -> int:
+        """The channels of the graph's input."""
+        return channel_count(self.inputs, self.per_channel)
 
     @property
     def sha256(self) -> str:
@@ -98,9 +83,22 @@ class Bundle:
         """Its first 12 digits, for people."""
         return self.sha256[:12]
 
+    @property
+    def dssim(self) -> float | None:
+        """Its error in fp32 on its real test set, else on its first; None where unknown."""
+        errors = self.metrics.get("error")
+        if not isinstance(errors, dict):
+            return None
+        for name in ("test-real", *errors):
+            try:
+                return float(errors[name]["exact"]["dssim"])
+            except (KeyError, TypeError, ValueError):
+                continue
+        return None
+
     @classmethod
     def load(cls, path: Path | str) -> Bundle:
-        """Reads and verifies a bundle's folder.
+        """The verified bundle in a folder.
 
         Raises BundleError when a file is missing, too large or doesn't match its hash, or when
         the configuration has an unknown, missing or impossible entry.
@@ -109,14 +107,13 @@ class Bundle:
         config = _read_json(path / CONFIG)
         metrics = _read_json(path / METRICS) if (path / METRICS).exists() else {}
         bundle = _from_config(path, config, metrics)
-        for name, expected in bundle.hashes.items():
-            found = _hash(path / name)
-            if found != expected:
-                raise BundleError(
-                    f"{path / name} is not the file that {CONFIG} describes "
-                    f"(sha256 {found[:12]}…, expected {expected[:12]}…)",
-                    fix="get the bundle again, or export it again",
-                )
+        found = _hash(path / MODEL)
+        if found != bundle.sha256:
+            raise BundleError(
+                f"{path / MODEL} is not the file that {CONFIG} describes "
+                f"(sha256 {found[:12]}…, expected {bundle.short_hash}…)",
+                fix="get the bundle again, or export it again",
+            )
         return bundle
 
 
@@ -134,60 +131,19 @@ def bundle_folders(root: Path | str) -> list[Path]:
     return [path.parent for path in sorted(Path(root).glob(f"*/*/{CONFIG}"))]
 
 
-def write_config(
-    path: Path | str,
-    *,
-    effect: str,
-    name: str,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    radius: float,
-    fov: float,
-    size_multiple: int,
-    halo: int,
-    ranges: Mapping[str, Sequence[float]] | None = None,
-    metrics: Mapping[str, Any] | None = None,
-    version: str = "1",
-    position_scale: str = "1/radius",
-    input_name: str = "gbuffer",
-    output_name: str = "shade",
-    background_halo: int | None = None,
-) -> Bundle:
-    """Completes a bundle's folder that already holds its model files: hashes and configuration.
+def write_config(path: Path | str, config: Mapping[str, Any], metrics: Mapping[str, Any]) -> Bundle:
+    """The bundle that a folder with its graph becomes: completed by configuration and metrics.
 
-    The optional files count if they are there: remove what belongs to an older model before.
-    Written atomically, `config.json` last: a folder without it is no bundle yet. Raises
-    BundleError for missing files or impossible values.
+    `config` holds the fields of `Bundle` but `path`, `hashes` and `metrics`. Written atomically,
+    `config.json` last: a folder without it is no bundle yet. Raises BundleError for a missing
+    graph or impossible values.
     """
     path = Path(path)
-    config: dict[str, Any] = {
-        "effect": effect,
-        "name": name,
-        "version": version,
-        "inputs": list(inputs),
-        "outputs": list(outputs),
-        "input_name": input_name,
-        "output_name": output_name,
-        "position_scale": position_scale,
-        "radius": radius,
-        "fov": fov,
-        "size_multiple": size_multiple,
-        "halo": halo,
-        "ranges": {key: list(value) for key, value in (ranges or {}).items()},
-        "hashes": {file: _hash(path / file) for file in _files(path)},
-    }
-    if background_halo is not None:
-        config["background_halo"] = background_halo
-    bundle = _from_config(path, config, dict(metrics or {}))
-    if metrics is not None:
-        _write_json(path / METRICS, metrics)
+    config = {**config, "hashes": {MODEL: _hash(path / MODEL)}}
+    bundle = _from_config(path, config, dict(metrics))
+    _write_json(path / METRICS, metrics)
     _write_json(path / CONFIG, config)
     return bundle
-
-
-def _files(path: Path) -> list[str]:
-    """What a bundle's folder holds of the files that its configuration vouches for."""
-    return [MODEL, WEIGHTS, *(name for name in (INT8, PROBE) if (path / name).exists())]
 
 
 def _hash(path: Path) -> str:
@@ -208,7 +164,7 @@ def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any])
             raise BundleError(
                 f"{where}: unknown entry '{key}'", fix=f"did you mean '{near}'?" if near else ""
             )
-    for key in ("effect", "name", "inputs", "outputs", "radius", "fov", "size_multiple", "halo"):
+    for key in _REQUIRED:
         if key not in config:
             near = nearest(key, config)
             hint = f"; is it '{near}'?" if near and near not in known else ""
@@ -224,11 +180,10 @@ def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any])
                 f"{where}: no attribute is called '{name}'",
                 fix=f"did you mean '{near}'?" if near else "",
             )
-    hashes = values.get("hashes", {})
-    for name in (MODEL, WEIGHTS):
-        if name not in hashes:
-            raise BundleError(f"{where}: 'hashes' has none for {name}", fix="export it again")
-    values["inputs"], values["outputs"] = tuple(values["inputs"]), tuple(values["outputs"])
+    if MODEL not in values.get("hashes", {}):
+        raise BundleError(f"{where}: 'hashes' has none for {MODEL}", fix="export it again")
+    for key in ("inputs", "outputs", "float32"):
+        values[key] = tuple(values.get(key, ()))
     values["ranges"] = {k: (float(v[0]), float(v[1])) for k, v in values.get("ranges", {}).items()}
     values["radius"], values["fov"] = float(values["radius"]), float(values["fov"])
     return Bundle(path=path, metrics=metrics, **values)
@@ -257,6 +212,12 @@ def _label(value: Any) -> bool:
     return isinstance(value, str) and _NAME.fullmatch(value) is not None
 
 
+def _tensors(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(
+        isinstance(v, str) and _TENSOR.fullmatch(v) is not None for v in value
+    )
+
+
 def _ranges(value: Any) -> bool:
     return isinstance(value, dict) and all(
         isinstance(v, (list, tuple)) and len(v) == 2 and all(map(_number, v)) and v[0] <= v[1]
@@ -271,6 +232,17 @@ def _hashes(value: Any) -> bool:
     )
 
 
+_REQUIRED = (
+    "effect",
+    "name",
+    "inputs",
+    "outputs",
+    "radius",
+    "fov",
+    "size_multiple",
+    "halo",
+    "bytes_per_pixel",
+)
 _CHECKS: dict[str, tuple[Any, str]] = {
     "effect": (lambda v: isinstance(v, str) and v in EFFECTS, f"one of {', '.join(EFFECTS)}"),
     "name": (_label, "a short name of letters, digits, '.', '_' and '-'"),
@@ -279,12 +251,14 @@ _CHECKS: dict[str, tuple[Any, str]] = {
     "outputs": (_names, "a list of channel names"),
     "input_name": (_label, "a tensor's name"),
     "output_name": (_label, "a tensor's name"),
-    "position_scale": (lambda v: v in _SCALES, f"one of {', '.join(_SCALES)}"),
     "radius": (lambda v: _number(v) and v > 0, "a number > 0"),
     "fov": (lambda v: _number(v) and 0 < v < 180, "degrees between 0 and 180"),
     "size_multiple": (lambda v: _whole(v, 1, 4096), "a whole number from 1 to 4096"),
     "halo": (lambda v: _whole(v, 0, 8192), "a whole number from 0 to 8192"),
-    "background_halo": (lambda v: _whole(v, 0, 8192), "a whole number from 0 to 8192"),
+    "bytes_per_pixel": (lambda v: _whole(v, 1, 1 << 24), "a whole number above 0"),
+    "per_channel": (lambda v: isinstance(v, bool), "true or false"),
+    "float32": (_tensors, "a list of names of the graph's tensors"),
+    "network": (lambda v: isinstance(v, dict), "an object"),
     "ranges": (_ranges, "pairs of numbers, lowest first"),
     "hashes": (_hashes, "file names with sha256 digests"),
 }

@@ -42,8 +42,8 @@ def shading(image: ArrayLike) -> Picture:
 
 
 def of_effect(image: ArrayLike, effect: Effect) -> Picture:
-    """(H, W, 3) of an effect's answer, as `effect.picture` says: `srgb` or `shading`."""
-    return shading(image) if effect.picture == "linear" else srgb(image)
+    """(H, W, 3) of an effect's answer: `srgb` for light, else `shading`."""
+    return srgb(image) if effect.is_light else shading(image)
 
 
 def normals(image: ArrayLike) -> Picture:

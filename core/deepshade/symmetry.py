@@ -14,25 +14,24 @@ from numpy.typing import NDArray
 
 from deepshade.attributes import ATTRIBUTES
 
-COUNT = 8
+ALL = tuple(range(8))
+# Those that mirror nothing: the quarter turns.
+ROTATIONS = (0, 3, 5, 6)
 
 
 def apply(image: NDArray[Any], attribute: str | None, symmetry: int) -> NDArray[Any]:
     """Apply `symmetry` (0 to 7) to planar images (..., C, H, W).
 
     `symmetry` & 1 mirrors left and right, & 2 up and down, & 4 swaps rows and columns, in this
-    order. Camera-space points and vectors of `attribute` change their x and y alike (motion its
-    u and v); None, and attributes without a direction, only move their pixels.
+    order. The x and y (u and v) of an `attribute` whose unit turns change alike; None, and
+    attributes without a direction, only move their pixels.
 
     Raises:
         ValueError: `symmetry` is out of range.
     """
-    if not 0 <= symmetry < COUNT:
-        raise ValueError(f"there is no symmetry {symmetry}, only 0 to {COUNT - 1}")
-    known = ATTRIBUTES.get(attribute) if attribute else None
-    turns = known is not None and (
-        known.kind == "motion" or (known.kind in ("point", "vector") and known.space == "camera")
-    )
+    if symmetry not in ALL:
+        raise ValueError(f"there is no symmetry {symmetry}, only 0 to {len(ALL) - 1}")
+    turns = ATTRIBUTES[attribute].unit.turns if attribute in ATTRIBUTES else None
     # A symmetry maps screen axes to screen axes: find which, and with what sign.
     x, y = (0, 1.0), (1, 1.0)
     if symmetry & 1:
@@ -41,10 +40,10 @@ def apply(image: NDArray[Any], attribute: str | None, symmetry: int) -> NDArray[
         image, y = image[..., ::-1, :], (y[0], -y[1])
     if symmetry & 4:
         image = image.swapaxes(-1, -2)
-        # Rows run down and y up, so the swap sends +x to -y; motion's v runs down like rows.
-        sign = 1.0 if known is not None and known.kind == "motion" else -1.0
+        # Rows run down and y up, so the swap sends +x to -y; the screen's v runs down like rows.
+        sign = 1.0 if turns == "screen" else -1.0
         x, y = (y[0], sign * y[1]), (x[0], sign * x[1])
-    if not turns:
+    if turns is None:
         return image
     planes = [image[..., x[0], :, :] * x[1], image[..., y[0], :, :] * y[1]]
     planes += [image[..., k, :, :] for k in range(2, image.shape[-3])]

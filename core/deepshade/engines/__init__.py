@@ -1,8 +1,8 @@
 """Running a bundle's network, on whichever engine and in whichever precision this machine has.
 
-    from deepshade.engines import available, load_engine
+    from deepshade.engines import choose, load_engine
 
-    engine = load_engine(bundle, available()[0], threads=cpu_count())
+    engine = load_engine(bundle, choose(), threads=cpu_count())
     engine.warm()
     shade = engine.predict(gbuffer)  # (N, C, H, W) float32 to (N, C', H, W) float32
 
@@ -10,7 +10,7 @@ Nothing heavy is imported before it is asked for.
 """
 
 from deepshade.engines.base import Backend, Engine
-from deepshade.engines.registry import REFERENCE, available, known, load_engine, usable
+from deepshade.engines.registry import REFERENCE, available, choose, load_engine
 from deepshade.errors import EngineError
 
 __all__ = [
@@ -19,7 +19,6 @@ __all__ = [
     "Engine",
     "EngineError",
     "available",
-    "known",
+    "choose",
     "load_engine",
-    "usable",
 ]

@@ -4,24 +4,20 @@ Three things here are measured rather than obvious:
 
 - In 16 bits the CPU plugin also rounds the arithmetic before the first convolution, such as the
   difference between two large positions (DSSIM + 35 % with bf16 on real views). So the graph is
-  cut there: what comes before runs as a graph of its own in float32, the rest in 16 bits, and the
-  tensors between them are handed over without a copy. After the last convolution the plugin
-  returns to float32 by itself.
+  split where the bundle says: what comes before runs as a graph of its own in float32, the rest
+  in 16 bits, and the tensors between them are handed over without a copy. After the last
+  convolution the plugin returns to float32 by itself.
 - A graph of fixed size runs up to 1.5 times as fast as one with free height and width, because
-  elementwise steps are only fused then. But it takes a tenth of a second or more to compile. So a
-  size runs on the free graph until it has come several times, and then, as soon as that is
-  compiled in the background, on one of a few fixed ones.
-- The plugin keeps what it prepared for every size it has seen, without end, unless its cache is
-  off, and keeps a prediction's memory until told otherwise.
+  elementwise steps are only fused then, and rounds differently. So every size is compiled when it
+  first comes, which takes a few tenths of a second, and kept.
+- The plugin keeps a prediction's memory until told otherwise.
 """
 
 from __future__ import annotations
 
+import random
 import threading
-import time
-from collections import OrderedDict
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from typing import Any
@@ -30,34 +26,21 @@ import numpy as np
 
 from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine, Float
-from deepshade.engines.cutting import cut, whole
+from deepshade.engines.splitting import split
 from deepshade.errors import EngineError
-from deepshade.machine import cpu_kind
 
-_TYPES = {"fp32": "f32", "bf16": "bf16", "fp16": "f16"}
-_CAPABILITIES = {"fp32": "FP32", "bf16": "BF16", "fp16": "FP16", "int8": "INT8"}
-# After how many predictions a size is compiled, how many of them are kept, and the input pixels
-# for which memory is kept, over all of them.
-_OFTEN = 4
-_SIZES = 12
-_LIVE_PIXELS = 4 * 2**20
-# Compiling takes as much memory as a prediction. For sizes above so many pixels it waits until
-# nothing has run for `_QUIET` seconds, but no longer than `_PATIENCE`.
-_LARGE = 2**20
-_QUIET, _PATIENCE = 0.1, 5.0
+_TYPES = {"bf16": "bf16", "fp32": "f32"}
+_CAPABILITIES = {"bf16": "BF16", "fp32": "FP32"}
+# How many compiled sizes are kept, and the input pixels for which memory is kept, over all.
+MAX_SIZES = 16
+MAX_LIVE_PIXELS = 4 * 2**20
 
 Shape = tuple[int, ...]
 
 
 def precisions(engine: str = "openvino") -> tuple[str, ...]:
-    """What this CPU does natively, and rightly. Raises EngineError where OpenVINO isn't installed.
-
-    Not 8 bits with AMX: on graphs of free size they may crash there (issue 37577 of
-    openvinotoolkit/openvino), and with 2026.4.1 our bundles came out up to 30 % worse.
-    """
+    """What this CPU does natively. Raises EngineError where OpenVINO isn't installed."""
     known = set(_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"))
-    if cpu_kind() == "amx":
-        known.discard("INT8")
     return tuple(name for name, capability in _CAPABILITIES.items() if capability in known)
 
 
@@ -67,108 +50,61 @@ def load(bundle: Bundle, backend: Backend, threads: int) -> Engine:
 
 
 class OpenVino(Engine):
-    """One bundle on OpenVINO. With n > 1 predictions at once each runs on threads/n threads."""
+    """One bundle, compiled for each size; predictions at the same time follow each other."""
 
     def __init__(self, bundle: Bundle, backend: Backend, *, threads: int) -> None:
         super().__init__(bundle, backend, threads=threads)
-        graph = bundle.model
-        self._type = _TYPES.get(backend.precision, "f32")
-        if backend.precision == "int8" and bundle.int8 is not None:
-            graph = bundle.int8
-            # What isn't quantised runs in the CPU's own 16 bits, if it has them.
-            self._type = "bf16" if "bf16" in precisions() else "f32"
+        self._type = _TYPES[backend.precision]
         try:
-            self._model = _core().read_model(str(graph))
+            self._model = _core().read_model(str(bundle.model))
         except RuntimeError as error:
-            raise EngineError(f"OpenVINO can't read {graph}: {_reason(error)}") from error
+            raise EngineError(f"OpenVINO can't read {bundle.model}: {_reason(error)}") from error
         self._lock = threading.Lock()
-        self._free: dict[int, _Network] = {}  # by threads of a prediction
-        self._fixed: OrderedDict[tuple[Shape, int], _Network] = OrderedDict()
-        self._seen: OrderedDict[tuple[Shape, int], int] = OrderedDict()  # how often
-        self._pending: dict[tuple[Shape, int], Future[None]] = {}
-        self._running = 0
-        self._ended = 0.0  # when the last prediction did
-        self._network(None, threads)
+        self._compiling = threading.Lock()
+        self._networks: dict[Shape, _Network] = {}
 
     def prepare(self, height: int, width: int) -> None:
         """See `Engine.prepare`."""
-        self._fix(((1, self.channels, height, width), self.threads))
+        self._network((1, self.bundle.channels, height, width))
+
+    def predict(self, gbuffer: Float) -> Float:
+        """See `Engine.predict`."""
+        network = self._network(gbuffer.shape)
+        shade = network.run(gbuffer)
+        self._bound(network)
+        return shade
 
     def shrink(self) -> None:
         """See `Engine.shrink`."""
         with self._lock:
-            networks = [*self._free.values(), *self._fixed.values()]
+            networks = list(self._networks.values())
         for network in networks:
             network.release()
 
-    def _run(self, gbuffer: Float, threads: int) -> Float:
-        key = (gbuffer.shape, threads)
+    def _network(self, shape: Shape) -> _Network:
         with self._lock:
-            network = self._fixed.get(key)
-            if network is not None:
-                self._fixed.move_to_end(key)
-            else:
-                self._seen[key] = self._seen.pop(key, 0) + 1
-                if self._seen[key] >= _OFTEN and key not in self._pending:
-                    self._pending[key] = _background.submit(self._fix_later, key)
-                if len(self._seen) > 64:
-                    self._seen.popitem(last=False)
-            self._running += 1
-        try:
-            if network is None:
-                network = self._network(None, threads)
-            shade = network.run(gbuffer)
-        finally:
+            if shape in self._networks:
+                return self._networks[shape]
+        with self._compiling:  # one at a time: it takes as much memory as a prediction
             with self._lock:
-                self._running -= 1
-                self._ended = time.monotonic()
-        self._bound(network)
-        return shade
+                if shape in self._networks:
+                    return self._networks[shape]
+            network = self._compile(shape)
+            with self._lock:
+                if len(self._networks) >= MAX_SIZES:
+                    # Were it the oldest, sizes in rotation would be compiled at each use.
+                    del self._networks[random.choice(list(self._networks))]
+                self._networks[shape] = network
+            return network
 
-    def _fix_later(self, key: tuple[Shape, int]) -> None:
-        """`_fix`, for a large size when nothing runs."""
-        latest = time.monotonic() + (_PATIENCE if _large(key[0]) else 0)
-        while time.monotonic() < latest:
-            if not self._running and time.monotonic() - self._ended > _QUIET:
-                break
-            time.sleep(_QUIET / 2)
-        self._fix(key)
-
-    def _fix(self, key: tuple[Shape, int]) -> None:
-        """Compile a size. One that fails stays on the free graph, and isn't tried again."""
-        shape, threads = key
-        with self._lock:
-            if key in self._fixed:
-                return
-        network = self._compile(shape, threads)
-        if _large(shape):
-            # The plugin has already taken what a prediction needs, and can't give it back before.
-            network.run(np.zeros(shape, np.float32))
-            network.release()
-        with self._lock:
-            self._fixed[key] = network
-            if len(self._fixed) > _SIZES:
-                self._fixed.popitem(last=False)
-            self._pending.pop(key, None)
-            free = self._free.get(threads)
-        if free is not None:
-            free.release()  # it won't be needed for this size again
-
-    def _network(self, shape: Shape | None, threads: int) -> _Network:
-        with self._lock:
-            if threads not in self._free:
-                self._free[threads] = self._compile(shape, threads)
-            return self._free[threads]
-
-    def _compile(self, shape: Shape | None, threads: int) -> _Network:
+    def _compile(self, shape: Shape) -> _Network:
         model = self._model.clone()
         try:
-            if shape is not None:
-                model.reshape(list(shape))
-            pieces = whole(model) if self._type == "f32" else cut(model)
+            model.reshape(list(shape))
+            pieces = split(model, () if self._type == "f32" else self.bundle.float32)
             settings = {
                 "INFERENCE_NUM_THREADS": self.threads,
-                "NUM_STREAMS": max(1, self.threads // threads),
+                "NUM_STREAMS": 1,
                 "ENABLE_CPU_PINNING": False,  # several graphs would be pinned to the same cores
                 "CPU_RUNTIME_CACHE_CAPACITY": "0",
             }
@@ -189,19 +125,19 @@ class OpenVino(Engine):
     def _bound(self, latest: _Network) -> None:
         """Release the memory of other sizes when together they hold too much."""
         with self._lock:
-            others = [n for n in (*self._free.values(), *self._fixed.values()) if n is not latest]
-        room = _LIVE_PIXELS - latest.held
+            others = [network for network in self._networks.values() if network is not latest]
+        left = MAX_LIVE_PIXELS - latest.held
         for network in reversed(others):
-            room -= network.held
-            if room < 0:
+            left -= network.held
+            if left < 0:
                 network.release()
 
 
 class _Network:
     """One compiled graph, or two that follow each other, and requests to run them with.
 
-    Of each graph the first inputs are these `channels` of the picture (see `cut`), and the others
-    what the graph before it puts out.
+    Of each graph the first inputs are these `channels` of the picture (see `split`), and the
+    others what the graph before it puts out.
     """
 
     def __init__(self, graphs: list[Any], channels: list[tuple[slice, ...]]) -> None:
@@ -254,14 +190,6 @@ class _Network:
         yield requests
         with self._lock:
             self._idle.append(requests)
-
-
-def _large(shape: Shape) -> bool:
-    return shape[2] * shape[3] > _LARGE
-
-
-# One at a time, so that compiling never takes more than one core from what is being shaded.
-_background = ThreadPoolExecutor(1, thread_name_prefix="compile")
 
 
 @cache

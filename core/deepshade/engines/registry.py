@@ -1,4 +1,4 @@
-"""Which backends there are, which of them this machine has, and how to get the others."""
+"""Which backends there are, which of them this machine has, and which one is used."""
 
 from __future__ import annotations
 
@@ -13,48 +13,56 @@ from deepshade.errors import EngineError, nearest
 # What every machine with the service has, and what the others are measured against.
 REFERENCE = Backend("onnxruntime", "fp32")
 
-_CPU = ("fp32", "bf16", "fp16", "int8")
-# engine -> (module, the precisions that it could have somewhere)
-_ENGINES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "onnxruntime": ("deepshade.engines.onnx", ("fp32", "int8")),
-    "openvino": ("deepshade.engines.openvino", _CPU),
-    "cuda": ("deepshade.engines.onnx", ("fp32",)),
-    "tensorrt": ("deepshade.engines.onnx", ("fp32", "fp16")),
+# engine -> its module; the engine that is used first, by rule, comes first
+_ENGINES = {
+    "cuda": "deepshade.engines.onnxruntime",
+    "openvino": "deepshade.engines.openvino",
+    "onnxruntime": "deepshade.engines.onnxruntime",
 }
 
 
 class _Module(Protocol):
     def precisions(self, engine: str) -> tuple[str, ...]:
-        """What `engine` can do on this machine; raises EngineError if it is not here at all."""
+        """What `engine` calculates in here, the one to use first; EngineError if it isn't here."""
 
     def load(self, bundle: Bundle, backend: Backend, threads: int) -> Engine:
         """The engine, not yet warm."""
 
 
-def known() -> list[Backend]:
-    """Every backend that deepshade can use, on whatever machine."""
-    return [Backend(engine, one) for engine, (_, all_) in _ENGINES.items() for one in all_]
-
-
 @cache
 def available() -> tuple[Backend, ...]:
-    """The backends that run on this machine, `REFERENCE` first if it is one of them."""
+    """The backends of this machine, in the order of the rule that chooses among them.
+
+    CUDA where there is a GPU, else OpenVINO, else ONNX Runtime; bf16 where the CPU calculates in
+    it, else fp32. The rule looks at the machine alone, so a request gets the same bytes always.
+    """
     found: list[Backend] = []
     for engine in _ENGINES:
         try:
-            found += [
-                Backend(engine, precision) for precision in _module(engine).precisions(engine)
-            ]
+            found += [Backend(engine, one) for one in _module(engine).precisions(engine)]
         except EngineError:
             continue
     return tuple(found)
 
 
+def choose(engine: str | None = None, precision: str | None = None) -> Backend:
+    """The first available backend that is as asked. Raises EngineError if none is."""
+    for backend in available():
+        if engine in (None, backend.engine) and precision in (None, backend.precision):
+            return backend
+    asked = "/".join(part or "*" for part in (engine, precision))
+    here = ", ".join(map(str, available()))
+    raise EngineError(
+        f"no '{asked[:100]}' on this machine" if here else "no engine is installed",
+        fix=f"one of: {here}" if here else "pip install 'deepshade[service]'",
+    )
+
+
 def load_engine(bundle: Bundle, backend: Backend, *, threads: int) -> Engine:
     """The bundle's network on that backend; call `warm` before timing it.
 
-    Raises EngineError: there is no such backend, this machine lacks it (and what to install), the
-    bundle has no file for it, or the library refuses the graph.
+    Raises EngineError: there is no such backend, this machine lacks it (and what to install), or
+    the library refuses the graph.
     """
     if backend.engine not in _ENGINES:
         near = nearest(backend.engine, _ENGINES)
@@ -68,18 +76,8 @@ def load_engine(bundle: Bundle, backend: Backend, *, threads: int) -> Engine:
             f"'{backend.engine}' has no precision '{backend.precision}' on this machine",
             fix=f"one of: {', '.join(precisions)}",
         )
-    if backend.precision == "int8" and bundle.int8 is None:
-        raise EngineError(
-            f"the bundle {bundle.effect}/{bundle.name} has no int8 graph",
-            fix="export it again, or choose another precision",
-        )
     return _module(backend.engine).load(bundle, backend, threads)
 
 
-def usable(bundle: Bundle) -> list[Backend]:
-    """`available`, less what this bundle has no file for."""
-    return [one for one in available() if one.precision != "int8" or bundle.int8 is not None]
-
-
 def _module(engine: str) -> _Module:
-    return cast(_Module, import_module(_ENGINES[engine][0]))
+    return cast(_Module, import_module(_ENGINES[engine]))

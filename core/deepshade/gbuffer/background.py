@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from deepshade.attributes import ATTRIBUTES
 from deepshade.floats import is_finite
 
 Array = NDArray[np.float32]
@@ -22,14 +23,16 @@ def remove(arrays: Mapping[str, Array], suspects: Collection[str]) -> tuple[Mask
     """Sets to 0 what shows no geometry; (these pixels, number that held NaN or infinities).
 
     `arrays` are (C, H, W) by quantity; only those named in `suspects` hold NaN or infinities,
-    and where they do all are set to 0 as well. Every pass over a picture counts: each quantity of
-    a block of rows is first asked, by its extremes, whether it shows any background, and not
-    asked where all are background already.
+    and where they do all are set to 0 as well. Attributes that say something of the background
+    (the sky's light) stay there, where they are finite. Every pass over a picture counts: each
+    quantity of a block of rows is first asked, by its extremes, whether it shows any background,
+    and not asked where all are background already.
     """
     background = np.zeros(next(iter(arrays.values())).shape[1:], np.bool_)
     count = 0
     # those first of which one channel tells
     asked = sorted(_EMPTY.keys() & arrays.keys(), key=list(_EMPTY).index)
+    stays = {name for name in arrays if in_background(name)}
     for rows in _blocks(background.shape):
         block = {name: array[:, rows] for name, array in arrays.items()}
         empty = background[rows]
@@ -39,8 +42,15 @@ def remove(arrays: Mapping[str, Array], suspects: Collection[str]) -> tuple[Mask
                 break
         if suspects:
             count += _broken({name: block[name] for name in suspects}, empty)
-        _clear(block.values(), empty)
+        _clear([array for name, array in block.items() if name not in stays], empty)
+        for name in stays.intersection(suspects):
+            _clear([block[name]], nonfinite(block[name]))
     return background, count
+
+
+def in_background(quantity: str) -> bool:
+    """Whether it says something where there is no surface too."""
+    return quantity in ATTRIBUTES and ATTRIBUTES[quantity].in_background
 
 
 def nonfinite(array: Array) -> Mask:

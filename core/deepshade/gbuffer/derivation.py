@@ -110,7 +110,12 @@ def _normal_from_position(s: Source) -> Array:
 
 
 def _view(s: Source) -> Array:
-    return _turned(rotation_of(s.world_to_camera).T, unit(-s.arrays["position"]))
+    toward = unit(-s.arrays["position"])
+    if s.camera is not None and not s.valid.all():
+        # The sky too is looked at from somewhere.
+        rays = s.camera.rays(*s.valid.shape[::-1])
+        np.copyto(toward, unit(-rays), where=~s.valid)
+    return _turned(rotation_of(s.world_to_camera).T, toward)
 
 
 def _angle_in_camera_space(s: Source) -> Array:
@@ -271,9 +276,9 @@ def circle_of_confusion(
         c = A (D - F) / (D F) · pixels_per_unit
 
     Positive behind the plane of focus, negative before it, 0 in it, A / F · pixels_per_unit at
-    infinity. Depths <= 0 are background and give 0.
+    infinity, which is where background lies: depths <= 0 count as infinite.
     """
-    safe = np.where(depth > 0, depth, focus)
+    safe = np.where(depth > 0, depth, np.inf)
     # 1/F - 1/D rather than (D - F)/(D F): no overflow for huge depths
     return (aperture * pixels_per_unit * (1.0 / focus - 1.0 / safe)).astype(np.float32)
 

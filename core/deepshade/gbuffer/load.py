@@ -27,12 +27,13 @@ Source = Path | str | bytes | tuple[str, bytes]
 class GBuffer:
     """Attributes of one view, ready for a network.
 
-    `attributes` maps names to (C, H, W) float32, C-contiguous; every attribute is 0 where
-    `background` (H, W) is true. `nonfinite` counts the pixels that held NaN or infinities (an
-    infinite depth is a renderer's way to say background and doesn't count). `mapped` tells which
-    channels each quantity came from, `decoded` all that were read for that, as (file, channel),
-    and `derived` how the others were computed. The windows, (x0, y0, x1, y1) inclusive, are those
-    of the part that the attributes came from.
+    `attributes` maps names to (C, H, W) float32, C-contiguous; where `background` (H, W) is true
+    all are 0 but those that say something of it (`Attribute.in_background`). `nonfinite` counts
+    the pixels that held NaN or infinities (an infinite depth is a renderer's way to say
+    background and doesn't count). `mapped` tells which channels each quantity came from,
+    `decoded` all that were read for that, as (file, channel), and `derived` how the others were
+    computed. The windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes
+    came from.
     """
 
     attributes: dict[str, NDArray[np.float32]]
@@ -163,14 +164,16 @@ def _derive(
             array = np.ascontiguousarray(step.function(source), np.float32)
         arrays[step.target] = array
         # finite input can still overflow float32: that pixel is background too
-        bad = background.nonfinite(array)
-        bad &= source.valid
+        broken = background.nonfinite(array)
+        bad = broken & source.valid
         if bad.any():
             grown += int(np.count_nonzero(bad))
             source.valid &= ~bad
-        background.clear([array], ~source.valid)
+        stays = background.in_background(step.target)
+        background.clear([array], broken if stays else ~source.valid)
     if grown:
-        background.clear(arrays.values(), ~source.valid)
+        surfaces = [a for name, a in arrays.items() if not background.in_background(name)]
+        background.clear(surfaces, ~source.valid)
     return ~source.valid, grown
 
 

@@ -1,0 +1,16 @@
+"""Directional occlusion: the environment's light that reaches a surface within a radius."""
+
+from deepshade.effects.effect import Effect
+from deepshade.symmetry import ROTATIONS
+
+EFFECT = Effect(
+    "do",
+    "Directional occlusion",
+    ("normal_world", "normal", "position"),
+    "(1/π)∫ V_R L_env cosθ dω; equals ao under a white environment",
+    lengths="radius",
+    background=1.0,
+    trivial=1.0,
+    settings=("radius", "environment"),
+    symmetries=ROTATIONS,
+)

@@ -1,0 +1,116 @@
+"""An OpenVINO graph in two: what must be calculated in float32, and the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from deepshade.errors import EngineError
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A graph. Its first inputs are these channels of the picture, and its others what the piece
+    before it puts out, in order. An `exact` one is to be calculated in float32.
+    """
+
+    model: Any
+    channels: tuple[slice, ...]
+    exact: bool = False
+
+
+def split(model: Any, float32: Collection[str] = ()) -> list[Piece]:
+    """The graph's pieces: up to the tensors named in `float32`, and from there. One without names.
+
+    Where a graph begins by taking some channels of the picture, those become inputs of its own:
+    they lie one after the other in memory, and to take them inside is to copy them. `model`,
+    whose only input is the picture, stays as it is. Raises EngineError if it lacks such a tensor.
+    """
+    from openvino import opset13
+
+    model = model.clone()
+    if not float32:
+        return [_piece([_source(node) for node in model.get_results()], _views(model))]
+    first = model.clone()
+    outputs = _tensors(first, float32)
+    given = []
+    for tensor in _tensors(model, float32):
+        entry = opset13.parameter(tensor.get_partial_shape(), tensor.get_element_type())
+        for reader in tensor.get_target_inputs():
+            reader.replace_source_output(entry.output(0))
+        given.append(entry)
+    results = [_source(node) for node in model.get_results()]
+    return [_piece(outputs, _views(first), exact=True), _piece(results, _views(model), given)]
+
+
+def _tensors(model: Any, names: Collection[str]) -> list[Any]:
+    """The outputs of nodes that go by these names, in their order."""
+    known = {
+        name: output
+        for node in model.get_ordered_ops()
+        for output in node.outputs()
+        for name in output.get_names()
+    }
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise EngineError(
+            f"the graph has no tensor '{missing[0]}', which its configuration marks as float32",
+            fix="export the bundle again",
+        )
+    return [known[name] for name in names]
+
+
+def _views(model: Any) -> dict[str, tuple[Any, slice]]:
+    """The picture, and what is cut out of its channels, as inputs: name -> (input, channels)."""
+    from openvino import opset13
+
+    (picture,) = model.get_parameters()
+    views = {_name(picture): (picture, slice(None))}
+    for entry in picture.output(0).get_target_inputs():
+        node = entry.get_node()
+        if node.get_type_name() != "Slice" or entry.get_index() != 0:
+            continue
+        bounds = [source.data.tolist() for source in _sources(node)[1:] if hasattr(source, "data")]
+        if len(bounds) != 4 or bounds[2:] != [[1], [1]]:  # first, last, step and axis
+            continue
+        view = opset13.parameter(node.output(0).get_partial_shape(), node.get_element_type())
+        for reader in node.output(0).get_target_inputs():
+            reader.replace_source_output(view.output(0))
+        views[_name(view)] = view, slice(bounds[0][0], bounds[1][0])
+    model.add_parameters([view for view, _ in list(views.values())[1:]])
+    return views
+
+
+def _piece(
+    outputs: list[Any],
+    views: dict[str, tuple[Any, slice]],
+    entries: Iterable[Any] = (),
+    *,
+    exact: bool = False,
+) -> Piece:
+    """What gives `outputs`, with those of the `views` that it needs and then `entries`."""
+    from openvino import Model
+
+    met: set[str] = set()
+    todo = [output.get_node() for output in outputs]
+    while todo:
+        node = todo.pop()
+        if _name(node) not in met:
+            met.add(_name(node))
+            todo += _sources(node)
+    used = [view for name, view in views.items() if name in met]
+    model = Model(outputs, [node for node, _ in used] + list(entries), "piece")
+    return Piece(model, tuple(channels for _, channels in used), exact)
+
+
+def _source(result: Any) -> Any:
+    return result.input_value(0)
+
+
+def _sources(node: Any) -> list[Any]:
+    return [entry.get_source_output().get_node() for entry in node.inputs()]
+
+
+def _name(node: Any) -> str:
+    return str(node.get_friendly_name())

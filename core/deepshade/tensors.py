@@ -1,0 +1,163 @@
+"""From attributes to what a network is given: order, scale, colour channel, tile, padding.
+
+The service, the trainer and the reports all make their tensors here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepshade.attributes import ATTRIBUTES
+from deepshade.effects import Effect
+
+Float = NDArray[np.float32]
+Box = tuple[int, int, int, int]  # top, bottom, left, right; the ends are exclusive
+
+# So far away nothing depends on where exactly; what matters is to stay finite, in 16 bits too.
+MAX_LENGTH = 6e4
+_STEP = 8  # every how many pixels the median depth is taken
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """One channel of a network's input: an (H, W) array, and what to divide it by."""
+
+    pixels: Float
+    divisor: float | None = None
+
+
+def channel_count(inputs: Iterable[str], per_channel: bool) -> int:
+    """The channels of a network's input; one run a colour channel sees one of each colour."""
+    return sum(_count(name, per_channel) for name in inputs)
+
+
+def channel_slices(inputs: Iterable[str], per_channel: bool) -> dict[str, slice]:
+    """Where in a network's input each attribute lies."""
+    found, start = {}, 0
+    for name in inputs:
+        stop = start + _count(name, per_channel)
+        found[name] = slice(start, stop)
+        start = stop
+    return found
+
+
+def length_scale(effect: Effect, attributes: Mapping[str, Float], radius: float) -> float:
+    """What an effect's lengths are divided by: `radius`, or the picture's median depth.
+
+    1 where that is wanted and no pixel shows a surface.
+    """
+    if effect.lengths == "radius":
+        return radius
+    if "depth" in attributes:
+        depth = attributes["depth"][0, ::_STEP, ::_STEP]
+    elif "position" in attributes:
+        depth = -attributes["position"][2, ::_STEP, ::_STEP]
+    else:
+        return 1.0  # nothing of the effect is a length
+    depth = depth[np.isfinite(depth) & (depth > 0)]
+    return float(np.median(depth)) if depth.size else 1.0
+
+
+def planes(
+    attributes: Mapping[str, Float],
+    inputs: Sequence[str],
+    scale: float,
+    *,
+    channel: int | None = None,
+) -> list[Plane]:
+    """The channels of a network's input, in its order, not yet scaled.
+
+    `attributes` are (C, H, W) in physical units, `scale` is what lengths are divided by. With a
+    `channel` (0 to 2) of each colour only that one is taken: a run for one colour channel.
+    """
+    found: list[Plane] = []
+    for name in inputs:
+        attribute, pixels = ATTRIBUTES[name], attributes[name]
+        if channel is not None and attribute.coloured:
+            pixels = pixels[channel : channel + 1]
+        divisor = scale if attribute.unit.scaled and scale != 1 else None
+        found += [Plane(plane, divisor) for plane in pixels]
+    return found
+
+
+def cut(channels: Sequence[Plane], box: Box) -> Float:
+    """(1, C, bottom - top, right - left): the box of every channel, scaled; 0 past the picture.
+
+    No copy where the planes are that already.
+    """
+    height, width = channels[0].pixels.shape
+    top, bottom, left, right = box
+    if box == (0, height, 0, width) and (block := _block(channels)) is not None:
+        return block[None]
+    rows, columns = min(bottom, height) - top, min(right, width) - left
+    tensor = np.empty((1, len(channels), bottom - top, right - left), np.float32)
+    tensor[:, :, rows:, :] = 0
+    tensor[:, :, :, columns:] = 0
+    for plane, target in zip(channels, tensor[0], strict=True):
+        source = plane.pixels[top : top + rows, left : left + columns]
+        if plane.divisor is None:
+            target[:rows, :columns] = source
+        else:
+            scale(source, plane.divisor, target[:rows, :columns])
+    return tensor
+
+
+def tensor(
+    effect: Effect,
+    attributes: Mapping[str, Float],
+    inputs: Sequence[str],
+    radius: float,
+    *,
+    per_channel: bool,
+    multiple: int = 1,
+) -> Float:
+    """(N, C, h, w): a whole picture, sides padded with 0 to multiples of `multiple`.
+
+    N is 3 with `per_channel`, one run for each colour channel, else 1.
+    """
+    by = length_scale(effect, attributes, radius)
+    height, width = attributes[inputs[0]].shape[1:]
+    box = 0, up(height, multiple), 0, up(width, multiple)
+    runs = range(3) if per_channel else (None,)
+    return np.concatenate([cut(planes(attributes, inputs, by, channel=run), box) for run in runs])
+
+
+def scale(source: Float, divisor: float, out: Float) -> None:
+    """Lengths `source` (H, W) divided into `out`, so bounded that they stay finite."""
+    with np.errstate(over="ignore"):
+        np.divide(source, np.float32(divisor), out=out)
+    if out.size and (out.max() > MAX_LENGTH or out.min() < -MAX_LENGTH):
+        np.clip(out, -MAX_LENGTH, MAX_LENGTH, out=out)
+
+
+def up(value: int, multiple: int) -> int:
+    """`value` rounded up to a multiple."""
+    return -(-value // multiple) * multiple
+
+
+def _count(name: str, per_channel: bool) -> int:
+    attribute = ATTRIBUTES[name]
+    return 1 if per_channel and attribute.coloured else len(attribute.channels)
+
+
+def _block(channels: Sequence[Plane]) -> Float | None:
+    """(C, H, W) if the planes lie one after the other in one array, unscaled; else None."""
+    arrays = [plane.pixels for plane in channels]
+    owner = arrays[0].base
+    if any(plane.divisor is not None for plane in channels) or not (
+        isinstance(owner, np.ndarray)
+        and owner.dtype == np.float32
+        and owner.flags.c_contiguous
+        and all(array.base is owner and array.flags.c_contiguous for array in arrays)
+    ):
+        return None
+    size = arrays[0].nbytes
+    starts = [array.ctypes.data - owner.ctypes.data for array in arrays]
+    first = starts[0] // size
+    if starts != [(first + k) * size for k in range(len(arrays))]:
+        return None
+    return owner.reshape(-1, *arrays[0].shape)[first : first + len(arrays)]

@@ -1,0 +1,158 @@
+"""An exported ONNX graph: made smaller, and what it says of itself for a bundle's configuration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+CONVOLUTIONS = {"Conv", "ConvTranspose", "MatMul", "Gemm"}
+# What of ONNX Runtime's basic passes would join weights to their neighbours, or rename them.
+_FUSIONS = [
+    "ConvAddFusion",
+    "ConvMulFusion",
+    "ConvBNFusion",
+    "ConvActivationFusion",
+    "MatMulAddFusion",
+    "ReluClipFusion",
+    "PadFusion",
+]
+
+
+def fold_constants(path: Path, target: Path) -> Any:
+    """Write the graph in `path` with what no input has a part in calculated once; returns it.
+
+    Two thirds of what the exporter writes computes constant sizes and paddings. Weights keep their
+    names. The graph stays plain ONNX.
+    """
+    import onnx
+    import onnxruntime as ort
+
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.optimized_model_filepath = str(target)
+    options.log_severity_level = 3
+    ort.InferenceSession(
+        str(path), options, providers=["CPUExecutionProvider"], disabled_optimizers=_FUSIONS
+    )
+    model = onnx.load(str(target))
+    plain = [entry for entry in model.opset_import if entry.domain == ""]
+    del model.opset_import[:]
+    model.opset_import.extend(plain)
+    _shorten_names(model.graph)
+    onnx.save(model, str(target))
+    return model
+
+
+def float32_boundary(model: Any) -> list[str]:
+    """Names of the tensors at which the arithmetic before all convolutions ends.
+
+    It is arithmetic on lengths, which 16 bits would round (`Bundle.float32`). What follows a
+    convolution may be calculated in 16 bits; shapes, which are integers, stay with their users.
+    """
+    import onnx
+
+    graph = onnx.shape_inference.infer_shapes(model).graph
+    floats = {
+        value.name
+        for value in (*graph.value_info, *graph.output)
+        if value.type.tensor_type.elem_type == onnx.TensorProto.FLOAT
+    }
+    makers = {name: node for node in graph.node for name in node.output}
+    constant = {tensor.name for tensor in graph.initializer}
+    later: set[str] = set()
+    for node in graph.node:  # ONNX keeps them in order
+        sources = list(_sources(node))
+        if node.op_type in CONVOLUTIONS or later.intersection(sources):
+            later.update(node.output)
+        elif constant.issuperset(sources):
+            constant.update(node.output)
+    todo = [
+        name for node in graph.node if later.intersection(node.output) for name in _sources(node)
+    ]
+    boundary: dict[str, None] = {}
+    met: set[str] = set()
+    while todo:
+        name = todo.pop(0)
+        if name in met or name in later or name in constant or name not in makers:
+            continue
+        met.add(name)
+        if name in floats:
+            boundary[name] = None
+        else:
+            todo += _sources(makers[name])
+    return list(boundary)
+
+
+def bytes_per_pixel(model: Any, name: str, shape: tuple[int, int, int]) -> int:
+    """The most memory, in bytes a pixel, that tensors take at any time of a prediction in float32.
+
+    `shape` is (channels, height, width) of a picture for the input `name`. A tensor lives from the
+    node that makes it to the last that reads it; input and output count.
+    """
+    import numpy as np
+    import onnx
+    import onnxruntime as ort
+
+    watched = onnx.ModelProto()
+    watched.CopyFrom(model)
+    del watched.graph.output[:]
+    names = [output for node in model.graph.node for output in node.output]
+    watched.graph.output.extend(onnx.ValueInfoProto(name=each) for each in names)
+    session = ort.InferenceSession(watched.SerializeToString(), providers=["CPUExecutionProvider"])
+    picture = np.zeros((1, *shape), np.float32)
+    sizes = {
+        each: v.nbytes for each, v in zip(names, session.run(names, {name: picture}), strict=True)
+    }
+    sizes[name] = picture.nbytes
+    last = {source: k for k, node in enumerate(model.graph.node) for source in _sources(node)}
+    for output in model.graph.output:
+        last[output.name] = len(model.graph.node)
+    live = peak = sizes[name]
+    for k, node in enumerate(model.graph.node):
+        live += sum(sizes.get(output, 0) for output in node.output)
+        peak = max(peak, live)
+        gone = {source for source in _sources(node) if last[source] == k}
+        live -= sum(sizes.get(source, 0) for source in gone)  # weights aren't among the sizes
+    return math.ceil(peak / (shape[1] * shape[2]))
+
+
+def _sources(node: Any) -> Iterator[str]:
+    """The tensors that a node reads, in its branches too."""
+    yield from (name for name in node.input if name)
+    for attribute in node.attribute:
+        if attribute.HasField("g"):
+            for inner in attribute.g.node:
+                yield from _sources(inner)
+
+
+def _shorten_names(graph: Any) -> None:
+    """Number the tensors that have no name of their own: names take more room than nodes."""
+    kept = {value.name for value in (*graph.input, *graph.output)}
+    kept |= {
+        tensor.name for tensor in graph.initializer if not tensor.name.startswith(("/", "onnx"))
+    }
+    short: dict[str, str] = {}
+
+    def rename(name: str) -> str:
+        if not name or name in kept:
+            return name
+        return short.setdefault(name, f"t{len(short)}")
+
+    def visit(inner: Any) -> None:
+        for tensor in inner.initializer:
+            tensor.name = rename(tensor.name)
+        for node in inner.node:
+            node.name = ""
+            node.input[:] = map(rename, node.input)
+            node.output[:] = map(rename, node.output)
+            for attribute in node.attribute:
+                if attribute.HasField("g"):
+                    visit(attribute.g)
+        if inner is not graph:
+            for value in inner.output:
+                value.name = rename(value.name)
+
+    del graph.value_info[:]
+    visit(graph)
