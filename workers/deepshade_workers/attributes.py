@@ -36,7 +36,8 @@ def make_attributes(
     camera, header = view.camera, view.header()
     met = derivation.requirements(camera, camera.matrix, header)
     made = {*_TRACED, *_LIGHT}
-    wanted, steps = set(names), []
+    wanted = set(names)
+    steps: list[derivation.Derivation] = []
     for name in sorted(wanted):
         found = derivation.plan(name, {*made, *(step.target for step in steps)}, met)
         if found is None:
@@ -78,7 +79,7 @@ def _normal(scene: Scene, view: View, hits: Hits) -> Image:
 
 def _material(scene: Scene, view: View, hits: Hits, *, name: str) -> Image:
     start, stop = MATERIAL_CHANNELS[name]
-    return hits.planar(material(hits, name, stop - start)) * _valid(hits)
+    return np.where(_valid(hits), hits.planar(material(hits, name, stop - start)), 0)
 
 
 def _motion(scene: Scene, view: View, hits: Hits) -> Image:
