@@ -83,7 +83,8 @@ def main() -> None:
         print(json.dumps(result))
         return
     print(
-        f"{describe()}: {options.views} views of 256 x 256 at 256 rays a pixel, {options.rounds} rounds"
+        f"{describe()}: {options.views} views of 256 x 256 at 256 rays a pixel, "
+        f"{options.rounds} rounds"
     )
     for name, rate in rates.items():
         print(f"  {name:8} {rate:.2f} views a second")
