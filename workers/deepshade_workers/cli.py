@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -139,7 +140,7 @@ def datagen(
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
-    from deepshade_workers.datagen import DataSpec, expand_scenes, generate, rate
+    from deepshade_workers.datagen import DataSpec, expand_scenes, generate
 
     spec = DataSpec(
         scenes=expand_scenes(scenes),
@@ -153,68 +154,42 @@ def datagen(
         min_contrast=min_contrast,
         shard_size=shard_size,
     )
-    begun, start, done = time.monotonic(), None, 0
-    with _progress(hidden=as_json) as report:
-        for done, total in generate(spec, out, address=address):
-            start = done if start is None else start
-            report(done, total)
-    fresh = done - (start or 0)
+    begun = time.monotonic()
+    done, fresh = _watched(generate(spec, out, address=address), hidden=as_json)
+    seconds = time.monotonic() - begun
     summary = {
         "out": str(out),
         "views": done,
         "rendered": fresh,
-        "seconds": round(time.monotonic() - begun, 2),
-        "views_per_second": round(rate(fresh, begun), 3),
+        "seconds": round(seconds, 2),
+        "views_per_second": round(fresh / max(seconds, 1e-9), 3),
     }
     typer.echo(json.dumps(summary) if as_json else f"{done} views in {out}, {fresh} of them new")
 
 
-class _progress:
-    """A bar with rate and time left on a terminal, a line every 15 s elsewhere."""
+def _watched(steps: Iterator[tuple[int, int]], *, hidden: bool) -> tuple[int, int]:
+    """Samples (done, newly rendered) after all `steps` of (done, in all).
 
-    def __init__(self, *, hidden: bool) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
+    They show as a bar on a terminal, as a line every 15 s elsewhere.
+    """
+    from rich import progress
+    from rich.console import Console
 
-        self.console = Console(stderr=True)
-        self.plain = not self.console.is_terminal
-        self.hidden = hidden
-        self.last = self.begun = time.monotonic()
-        self.first: int | None = None
-        self.bar = Progress(
-            TextColumn("rendering"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=self.console,
-            disable=self.plain or hidden,
-        )
-        self.task = self.bar.add_task("", total=None, rate="")
-
-    def __enter__(self) -> Any:
-        self.bar.start()
-        return self.report
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.stop()
-
-    def report(self, done: int, total: int) -> None:
-        from deepshade_workers.datagen import rate
-
-        self.first = done if self.first is None else self.first
-        speed = rate(done - self.first, self.begun)
-        self.bar.update(self.task, completed=done, total=total, rate=f"{speed:.2f}/s")
-        now = time.monotonic()
-        if self.plain and not self.hidden and now - self.last > 15:
-            self.last = now
-            left = f"{(total - done) / speed / 60:.1f} min left" if speed else ""
-            self.console.print(f"rendering {done}/{total}  {speed:.2f}/s  {left}", style=None)
+    console = Console(stderr=True)
+    plain = not console.is_terminal
+    columns = ("rendering", progress.BarColumn(), progress.MofNCompleteColumn())
+    times = ("{task.fields[rate]}", progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
+    begun = said = time.monotonic()
+    first, done = None, 0
+    with progress.Progress(*columns, *times, console=console, disable=plain or hidden) as bar:
+        task = bar.add_task("", total=None, rate="")
+        for done, total in steps:
+            first = done if first is None else first
+            now = time.monotonic()
+            rate = (done - first) / max(now - begun, 1e-9)
+            bar.update(task, completed=done, total=total, rate=f"{rate:.2f}/s")
+            if plain and not hidden and now - said > 15:
+                said = now
+                left = f"{(total - done) / rate / 60:.1f} min left" if rate else ""
+                console.print(f"rendering {done}/{total}  {rate:.2f}/s  {left}")
+    return done, done - (first or 0)

@@ -6,7 +6,6 @@ import itertools
 import math
 import os
 import socket
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -227,7 +226,8 @@ def generate(
         tally = tally.remote()
         task = ray.remote(num_cpus=1, max_retries=5)(_shard_task)
         # A few at a time: a kill then loses little, and the cluster's memory stays flat.
-        slots = max(1, 2 * int(_resources().get("CPU", 1)))
+        resources = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        slots = max(1, 2 * int(resources.get("CPU", 1)))
         running: list[Any] = []
         counted = ready
         waiting = iter(missing)
@@ -324,15 +324,3 @@ def _knock(address: str) -> None:
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdigit():
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
-
-
-def _resources() -> dict[str, float]:
-    import ray
-
-    found: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
-    return found
-
-
-def rate(done: int, since: float) -> float:
-    """Samples a second since the time `since` (time.monotonic)."""
-    return done / max(time.monotonic() - since, 1e-9)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
@@ -58,12 +57,11 @@ def render(
         "deepshade:spp": rays_used(samples),
     }
     target.parent.mkdir(parents=True, exist_ok=True)
+    # Attributes in 16 bits where their units allow that; references keep 32.
+    narrow = [a.channels for a in ATTRIBUTES.values() if a.unit.storage == "float16"]
+    half = {channel for channels in narrow for channel in channels}
     exr.write(
-        target,
-        channels(images, effects, names),
-        attributes=header,
-        half=half_channels(),
-        compression="zip",
+        target, channels_of(images, names, effects), attributes=header, half=half, compression="zip"
     )
     figures: dict[str, Any] = {
         "file": str(target),
@@ -81,11 +79,9 @@ def render(
     return figures
 
 
-def channels(
-    images: Images, effects: Sequence[str], attributes: Sequence[str]
-) -> dict[str, NDArray[np.float32]]:
-    """Canonical EXR channels of `attributes` and the references of `effects` in `images`."""
-    found: dict[str, NDArray[np.float32]] = {}
+def channels_of(images: Images, attributes: Iterable[str], effects: Iterable[str]) -> Images:
+    """Canonical EXR channels, (H, W), of `attributes` and the references of `effects`."""
+    found: Images = {}
     for name in attributes:
         found |= dict(zip(ATTRIBUTES[name].channels, images[name], strict=True))
     for effect in effects:
@@ -95,9 +91,3 @@ def channels(
             for letter, plane in zip(letters, images[layer], strict=True):
                 found[f"{layer}.{letter}"] = plane
     return found
-
-
-def half_channels() -> set[str]:
-    """EXR channels stored with 16 bits: attributes whose unit they hold; references keep 32."""
-    narrow = (a for a in ATTRIBUTES.values() if a.unit.storage == "float16")
-    return {channel for attribute in narrow for channel in attribute.channels}

@@ -12,11 +12,6 @@ from deepshade_workers.trace import trace
 from deepshade_workers.view import Images, View
 
 
-def inputs_of(effects: Iterable[str]) -> list[str]:
-    """The attributes that `effects` start from, each once."""
-    return list(dict.fromkeys(name for effect in effects for name in EFFECTS[effect].inputs))
-
-
 def render_sample(
     scene: Scene,
     view: View,
@@ -39,8 +34,9 @@ def render_sample(
         SceneError: the view moves an object that the scene doesn't have.
     """
     references = {effect: reference_of(effect) for effect in effects}
+    names = {*attributes, *(name for effect in references for name in EFFECTS[effect].inputs)}
     hits = trace(scene, view.camera, width, height)
-    images = make_attributes(scene, view, hits, [*attributes, *inputs_of(references)], seed=seed)
+    images = make_attributes(scene, view, hits, names, seed=seed)
     for effect, reference in references.items():
         value, error = reference(scene, view, hits, images, samples=samples, seed=seed)
         images[f"reference_{effect}"] = value

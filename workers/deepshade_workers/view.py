@@ -13,7 +13,7 @@ from deepshade.camera import Camera
 from deepshade.effects import SETTINGS
 
 Vector = tuple[float, float, float]
-Image = NDArray[np.float32]  # planar (C, H, W)
+Image = NDArray[np.float32]  # planar: (C, H, W)
 Images = dict[str, Image]
 
 

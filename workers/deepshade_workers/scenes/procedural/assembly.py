@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from deepshade_workers.scenes.mesh import Floats, Material, Mesh, merge
 from deepshade_workers.scenes.procedural.primitives import Rng, along, box, cylinder, place, sphere
+
+Size = tuple[float, float, float]
 
 # How many materials scatter light below their surface, and how far it gets (scene units).
 SCATTERING_SHARE = 0.4
@@ -54,19 +58,19 @@ class Assembly:
         self._names.append(f"object {self._coats}")
 
     def box(
-        self,
-        center: tuple[float, float, float] | Floats,
-        size: tuple[float, float, float] | Floats,
-        rotation: Floats | None = None,
+        self, center: Size | Floats, size: Size | Floats, rotation: Floats | None = None
     ) -> None:
         """Place a box by its centre and full size."""
         self.add(box(), place(center, size, rotation))
 
+    def boxes_at(self, at: Floats, turn: Floats) -> Callable[[Size, Size], None]:
+        """A function that places a box by its offset from `at` and its size, turned by `turn`."""
+        return lambda offset, size: self.box(at + turn @ np.array(offset), size, turn)
+
     def span(self, low: tuple[float, ...], high: tuple[float, ...]) -> None:
         """Place a box from its lowest to its highest corner."""
-        center = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-        size = [abs(b - a) for a, b in zip(low, high, strict=True)]
-        self.add(box(), place((center[0], center[1], center[2]), (size[0], size[1], size[2])))
+        a, b = np.array(low, np.float64), np.array(high, np.float64)
+        self.box((a + b) / 2, abs(b - a))
 
     def bar(self, start: Floats, end: Floats, thickness: float, sides: int = 12) -> None:
         """Place a round bar between two points."""
