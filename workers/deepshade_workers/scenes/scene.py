@@ -56,9 +56,10 @@ class Scene:
         for name in by_name:
             if name not in names:
                 near = nearest(name, names)
+                hint = f"did you mean {near!r}? " if near else ""
                 raise SceneError(
                     f"scene {self.name!r} has no object {name!r}",
-                    fix=f"did you mean {near!r}?" if near else "see Scene.objects",
+                    fix=f"{hint}it has {', '.join(names[:8]) or 'none that can move'}",
                 )
         return np.array([by_name.get(name, (0, 0, 0)) for name in names], np.float64)
 
