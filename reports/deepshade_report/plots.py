@@ -44,7 +44,7 @@ PALETTE = {
 DPI = 100
 _OWN = {"fast": "vermillion", "balanced": "green", "best": "blue", PAPER: "ink"}
 _SPARE = ("sky", "purple", "orange", "soft")
-_MARKERS = {"fp32": "o", "bf16": "s"}
+_MARKERS = {"fp32": "o", "bf16": "s", "int8": "^"}
 _STAGES = {
     "decode": "sky",
     "plan": "purple",
