@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Annotated
 import typer
 
 Vector = tuple[float, float, float]
+
+MAX_SIDE = 16384  # pixels
 
 
 def render(
@@ -47,6 +50,7 @@ def render(
     """
     import math
 
+    from deepshade.attributes import ATTRIBUTES
     from deepshade.camera import Camera
     from deepshade.errors import ConfigError
     from deepshade_workers.references import require
@@ -56,9 +60,12 @@ def render(
 
     if radius is not None and not (math.isfinite(radius) and radius > 0):
         raise ConfigError("radius", detail=f"the radius must be above 0, not {radius}")
-    names = [name.strip() for name in effects.split(",") if name.strip()]
+    names = _listed(effects)
     require(names)
-    chosen = _attributes(attributes)
+    chosen = _listed(attributes)
+    for name in chosen:
+        if name not in ATTRIBUTES:
+            raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called {name!r}")
     width, height = _size(size)
     camera = Camera.look_at(eye, target, up, fov, width, height)
     opened = open_scene(scene)
@@ -68,8 +75,9 @@ def render(
         focus=math.dist(eye, target) if focus is None else focus,
         aperture=aperture,
     )
+    shown = chosen or list(ATTRIBUTES)
     figures = render_view(
-        opened, view, output, effects=names, samples=spp, seed=seed, attributes=chosen
+        opened, view, output, effects=names, attributes=shown, samples=spp, seed=seed
     )
     if as_json:
         typer.echo(json.dumps(figures))
@@ -83,26 +91,19 @@ def render(
         )
 
 
-def _attributes(text: str) -> tuple[str, ...] | None:
-    from deepshade.attributes import ATTRIBUTES
-    from deepshade.errors import ConfigError
-
-    names = tuple(name.strip() for name in text.split(",") if name.strip())
-    for name in names:
-        if name not in ATTRIBUTES:
-            raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called {name!r}")
-    return names or None
+def _listed(text: str) -> list[str]:
+    """The names between commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _size(text: str) -> tuple[int, int]:
     from deepshade.errors import ConfigError
 
-    width, _, height = text.lower().partition("x")
-    if not (width.isdigit() and height.isdigit()) or not (
-        1 <= int(width) <= 16384 and 1 <= int(height) <= 16384
-    ):
-        raise ConfigError("size", detail=f"--size {text!r} must be like 768x512, up to 16384")
-    return int(width), int(height)
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text.lower())
+    width, height = map(int, found.groups()) if found else (0, 0)
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise ConfigError("size", detail=f"--size {text!r} must be like 768x512, up to {MAX_SIDE}")
+    return width, height
 
 
 def datagen(

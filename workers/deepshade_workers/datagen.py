@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -47,15 +47,11 @@ class DataSpec:
     shard_size: int = 128
 
     def __post_init__(self) -> None:
-        for key in ("views", "size", "spp", "shard_size"):
-            if getattr(self, key) < 1:
-                raise ConfigError(key, detail=f"{key} must be at least 1, not {getattr(self, key)}")
-        if self.frame < self.size:
-            raise ConfigError(
-                "frame", detail=f"frame {self.frame} is smaller than size {self.size}"
-            )
-        if self.seed < 0:
-            raise ConfigError("seed", detail=f"the seed must be 0 or more, not {self.seed}")
+        least = {"views": 1, "size": 1, "frame": self.size, "spp": 1, "seed": 0, "shard_size": 1}
+        for key, low in least.items():
+            value = getattr(self, key)
+            if value < low:
+                raise ConfigError(key, detail=f"{key} must be at least {low}, not {value}")
         if self.radius is not None and not (math.isfinite(self.radius) and self.radius > 0):
             raise ConfigError("radius", detail=f"the radius must be above 0, not {self.radius}")
         require(self.effects)
@@ -179,10 +175,11 @@ def open_manifest(spec: DataSpec, folder: Path) -> Manifest:
     Raises:
         DataError: the folder holds a data set of other settings.
     """
+    ours = spec.settings()
     if not (folder / NAME).exists():
-        return Manifest(spec.settings(), schema(spec.effects, spec.size))
+        return Manifest(ours, schema(spec.effects, spec.size))
     manifest = Manifest.read(folder)
-    theirs, ours = manifest.settings, spec.settings()
+    theirs = manifest.settings
     differing = [key for key in ours if theirs.get(key) != ours[key]]
     if differing == ["views"] and theirs["views"] < spec.views:
         return Manifest(ours, manifest.schema, manifest.shards)
@@ -216,7 +213,7 @@ def generate(
     for leftover in folder.glob(".*.tmp"):  # of a job killed while it wrote
         leftover.unlink(missing_ok=True)
     missing = [k for k in range(spec.shards) if not _complete(spec, k, manifest, folder)]
-    ready = spec.views - sum(len(spec.samples(k)) for k in missing)
+    counted = ready = spec.views - sum(len(spec.samples(k)) for k in missing)
     yield ready, spec.views
     if not missing:
         return
@@ -229,7 +226,6 @@ def generate(
         resources = ray.cluster_resources()  # type: ignore[no-untyped-call]
         slots = max(1, 2 * int(resources.get("CPU", 1)))
         running: list[Any] = []
-        counted = ready
         waiting = iter(missing)
         while True:
             for k in itertools.islice(waiting, slots - len(running)):
@@ -281,22 +277,15 @@ def _shard_task(spec: DataSpec, index: int, folder: str, home: str, tally: Any) 
     os.chdir(home)  # scenes may have relative names
     mitsuba()
     dr.set_thread_count(1)  # Ray gave this task one core
-    count = 0
-
-    def tick() -> None:
-        nonlocal count
-        count += 1
-        tally.set.remote(index, count)
-
-    return make_shard(spec, index, Path(folder), tick)
+    counts = itertools.count(1)
+    return make_shard(spec, index, Path(folder), lambda: tally.set.remote(index, next(counts)))
 
 
 def _result(reference: Any) -> Shard:
     import ray
 
     try:
-        shard: Shard = ray.get(reference)
-        return shard
+        return cast(Shard, ray.get(reference))
     except ray.exceptions.RayTaskError as error:
         raise error.cause if isinstance(error.cause, SceneError) else error from None
 
@@ -308,19 +297,14 @@ def _connect(address: str | None) -> None:
     where = address or os.environ.get("RAY_ADDRESS") or "local"
     options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
     if where == "local":
-        options |= {"include_dashboard": False}
+        options["include_dashboard"] = False
+    host, _, port = where.removeprefix("ray://").rpartition(":")
     try:
-        _knock(where)
+        if host and port.isdigit():  # where nothing listens Ray itself would try for minutes
+            socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
         ray.init(address=where, **options)
-    except (ConnectionError, OSError) as error:
+    except OSError as error:
         raise DataError(
             f"there is no Ray cluster at {where}: {error}",
             fix="start one with 'ray start --head', or leave --address out",
         ) from error
-
-
-def _knock(address: str) -> None:
-    """Raise OSError if nothing listens at host:port; Ray itself would try for minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host and port.isdigit():
-        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()

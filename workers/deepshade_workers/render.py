@@ -24,31 +24,23 @@ def render(
     target: Path,
     *,
     effects: Sequence[str],
+    attributes: Sequence[str] = tuple(ATTRIBUTES),
     samples: int,
     seed: int,
-    attributes: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Figures for a report of `view`, which is rendered and written to `target`.
 
-    `attributes` are those to write, all by default. The same scene, view and seed give the same
-    file.
+    `attributes` are those to write. The same scene, view and seed give the same file.
 
     Raises:
         ConfigError: an effect has no reference, or an attribute needs a setting of the view.
         SceneError: the view moves an object that the scene doesn't have.
     """
-    names = tuple(ATTRIBUTES) if attributes is None else tuple(attributes)
     start = time.perf_counter()
-    width, height = view.camera.width, view.camera.height
+    size = view.camera.width, view.camera.height
+    asked = {*attributes, "depth"}
     images = render_sample(
-        scene,
-        view,
-        width,
-        height,
-        effects=effects,
-        attributes={*names, "depth"},
-        samples=samples,
-        seed=seed,
+        scene, view, *size, effects=effects, attributes=asked, samples=samples, seed=seed
     )
     header = {
         **view.header(),
@@ -60,12 +52,10 @@ def render(
     # Attributes in 16 bits where their units allow that; references keep 32.
     narrow = [a.channels for a in ATTRIBUTES.values() if a.unit.storage == "float16"]
     half = {channel for channels in narrow for channel in channels}
-    exr.write(
-        target, channels_of(images, names, effects), attributes=header, half=half, compression="zip"
-    )
+    exr.write(target, channels_of(images, attributes, effects), attributes=header, half=half)
     figures: dict[str, Any] = {
         "file": str(target),
-        "size": [width, height],
+        "size": list(size),
         "seconds": round(time.perf_counter() - start, 3),
         "background": int((images["depth"] == np.inf).sum()),
     }

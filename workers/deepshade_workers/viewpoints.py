@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from deepshade.camera import Camera
 from deepshade.errors import SceneError
 from deepshade_workers.references import ao
-from deepshade_workers.scenes.mesh import Floats
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, trace
 from deepshade_workers.view import Vector, View
@@ -29,7 +29,6 @@ def sample_view(
     *,
     frame: int,
     size: int,
-    fov: float = FOV,
     radius: float | None = None,
     min_contrast: float = 0.06,
     displacements: Mapping[str, Vector] | None = None,
@@ -45,7 +44,7 @@ def sample_view(
         SceneError: no such view turned up in `MAX_TRIES` tries.
     """
     for _ in range(MAX_TRIES):
-        camera = _random_camera(scene, rng, frame, size, fov)
+        camera = _random_camera(scene, rng, frame, size)
         factor = float(np.exp(rng.uniform(*np.log(RADIUS_RANGE))))
         seed = int(rng.integers(2**63))
         if camera is None:
@@ -66,9 +65,7 @@ def sample_view(
     )
 
 
-def _random_camera(
-    scene: Scene, rng: np.random.Generator, frame: int, size: int, fov: float
-) -> Camera | None:
+def _random_camera(scene: Scene, rng: np.random.Generator, frame: int, size: int) -> Camera | None:
     """Four in ten eyes lie anywhere in the scene's box, the others near what they look at."""
     low, high = scene.bounds
     target = scene.points[rng.integers(len(scene.points))]
@@ -81,8 +78,7 @@ def _random_camera(
     slack = 0.15 * (high - low)
     if not ((eye >= low - slack) & (eye <= high + slack)).all() or np.allclose(eye, target):
         return None
-    camera = Camera.look_at(eye, target, (0, 1, 0), fov, frame, frame)
-    return Camera(fov, frame, frame, camera.matrix, x0, y0)
+    return replace(Camera.look_at(eye, target, (0, 1, 0), FOV, frame, frame), x0=x0, y0=y0)
 
 
 def _shrunk(camera: Camera, size: int) -> Camera:
@@ -95,12 +91,11 @@ def _shrunk(camera: Camera, size: int) -> Camera:
 
 
 def _usable_depth(scene: Scene, hits: Hits) -> float | None:
-    valid: Floats = hits.valid.numpy()
+    """The median depth; None for views to refuse before any occlusion is rendered."""
+    valid = hits.valid.numpy()
     if valid.mean() < 1 - MAX_BACKGROUND:
         return None
     if hits.back.numpy()[valid].mean() > MAX_BACK_FACES:
         return None
     depth = hits.depth.numpy()[valid]
-    if np.percentile(depth, 2) < 0.002 * scene.extent:
-        return None
-    return float(np.median(depth))
+    return float(np.median(depth)) if np.percentile(depth, 2) >= 0.002 * scene.extent else None

@@ -38,18 +38,16 @@ def open_scene(name: str) -> Scene:
 
 def parse_procedural(name: str) -> tuple[str, int | None]:
     """Split `procedural:<family>[:<seed>]`; raises SceneError for an unknown family."""
-    _, family, *rest = [*name.split(":"), ""][:3] if ":" in name else ["", "", ""]
+    family, seed = [*name.split(":"), "", ""][1:3]
     if family not in FAMILIES:
         near = nearest(family, FAMILIES)
         hint = f"did you mean {near}? " if near else ""
         raise SceneError(
             f"no procedural family {family!r}", fix=f"{hint}there are {', '.join(FAMILIES)}"
         )
-    if not rest or not rest[0]:
-        return family, None
-    if not rest[0].isdigit():
+    if seed and not seed.isdecimal():
         raise SceneError(f"the seed in {name!r} must be a whole number, 0 or more")
-    return family, int(rest[0])
+    return family, int(seed) if seed else None
 
 
 def load_mesh(path: Path) -> Mesh:
@@ -89,26 +87,20 @@ def _placed(scene: Any, node: str) -> Mesh | None:
     part = scene.geometry[name]
     if not isinstance(part, trimesh.Trimesh) or not len(part.faces):
         return None
-    if abs(np.linalg.det(matrix[:3, :3])) == 0:
+    if np.linalg.det(matrix[:3, :3]) == 0:
         return None  # squashed flat: some exporters hide things so
     return _convert(part).transformed(np.asarray(matrix, np.float64))
 
 
 def _convert(part: Any) -> Mesh:
-    own = "vertex_normals" in part._cache and len(part.vertex_normals) == len(part.vertices)
-    normals = np.asarray(part.vertex_normals) if own else None
+    material = _material(part.visual)
     vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
-    if normals is None:
-        vertices, faces = _weld(vertices, faces)
-    return Mesh.build(
-        vertices, faces, crease=40, vertex_normals=normals, material=_material(part.visual)
-    )
-
-
-def _weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join vertices at the same place, so that normals smooth across texture seams."""
+    if "vertex_normals" in part._cache and len(part.vertex_normals) == len(vertices):
+        normals = np.asarray(part.vertex_normals)
+        return Mesh.build(vertices, faces, vertex_normals=normals, material=material)
+    # vertices at the same place become one, so that normals smooth across texture seams
     unique, index = np.unique(vertices, axis=0, return_inverse=True)
-    return unique, index.reshape(-1)[faces]
+    return Mesh.build(unique, index.reshape(-1)[faces], crease=40, material=material)
 
 
 def _material(visual: Any) -> Material:
@@ -122,8 +114,8 @@ def _material(visual: Any) -> Material:
         return Material()
     base = _mean_colour(getattr(material, "baseColorTexture", None))
     factor = getattr(material, "baseColorFactor", None)
-    if factor is None and getattr(material, "main_color", None) is not None:
-        factor = material.main_color
+    if factor is None:
+        factor = getattr(material, "main_color", None)
     if factor is not None:
         scale = 255.0 if np.asarray(factor).dtype.kind in "ui" else 1.0
         base = base * np.asarray(factor, np.float64)[:3] / scale

@@ -67,7 +67,8 @@ class Mesh:
         """
         vertices = np.asarray(vertices, np.float64).reshape(-1, 3)
         faces = np.asarray(faces, np.int64).reshape(-1, 3)
-        cross = _face_cross(vertices, faces)
+        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+        cross = np.cross(b - a, c - a)
         area = np.linalg.norm(cross, axis=1)
         keep = np.isfinite(area) & (area > 0)
         faces, cross, area = faces[keep], cross[keep], area[keep]
@@ -123,11 +124,6 @@ def merge(meshes: Iterable[Mesh], names: Sequence[str] = ()) -> Mesh:
         np.concatenate([part.materials for part in parts]),
         tuple(objects),
     )
-
-
-def _face_cross(vertices: Floats, faces: Ints) -> Floats:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return np.asarray(np.cross(b - a, c - a))
 
 
 def _smooth(faces: Ints, cross: Floats, flat: Floats, least: float) -> Floats:

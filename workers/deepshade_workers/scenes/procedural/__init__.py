@@ -9,14 +9,16 @@ import numpy as np
 
 from deepshade_workers.scenes.mesh import Mesh
 from deepshade_workers.scenes.procedural import exteriors, interiors, nature
+from deepshade_workers.scenes.procedural.assembly import Assembly
 
 _IN = (interiors.room, interiors.furniture, interiors.stairs, interiors.level)
 _OUT = (exteriors.colonnade, exteriors.town, exteriors.fences, exteriors.pipes, exteriors.machines)
 _GROWN = (nature.foliage, nature.rubble, nature.terrain, nature.cave, nature.blobs)
 _LOOSE = (nature.scattered, nature.figures, nature.drapery, nature.crockery)
 
+# Each places its solids in an assembly, with random numbers from the assembly's own generator.
 # Their order is that in which a data set takes them in turn.
-FAMILIES: dict[str, Callable[[np.random.Generator], Mesh]] = {
+FAMILIES: dict[str, Callable[[Assembly, np.random.Generator], None]] = {
     family.__name__: family for family in (*_IN, *_OUT, *_GROWN, *_LOOSE)
 }
 
@@ -24,4 +26,6 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Mesh]] = {
 def generate(family: str, seed: int) -> Mesh:
     """The mesh of `family` for `seed`: the same bytes every time."""
     key = int.from_bytes(hashlib.sha256(family.encode()).digest()[:4], "little")
-    return FAMILIES[family](np.random.default_rng([key, seed]))
+    assembly = Assembly(np.random.default_rng([key, seed]))
+    FAMILIES[family](assembly, assembly.rng)
+    return assembly.finish()

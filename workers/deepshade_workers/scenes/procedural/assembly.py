@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from deepshade_workers.scenes.mesh import Floats, Material, Mesh, merge
-from deepshade_workers.scenes.procedural.primitives import Rng, along, box, cylinder, place, sphere
+from deepshade_workers.scenes.procedural.primitives import Rng, along, box, cylinder, place
 
 Size = tuple[float, float, float]
 
@@ -76,13 +76,9 @@ class Assembly:
         """Place a round bar between two points."""
         self.add(cylinder(sides), along(start, end, thickness))
 
-    def ball(self, center: Floats, diameter: float, detail: int = 2) -> None:
-        """Place a ball."""
-        self.add(sphere(detail), place(center, diameter))
-
-    def floor(self, size: float = 24.0, height: float = 0.0) -> None:
-        """A thick square floor whose top is at `height`."""
-        self.box((0, height - 0.25, 0), (size, 0.5, size))
+    def floor(self, size: float) -> None:
+        """A thick square floor whose top is at 0."""
+        self.box((0, -0.25, 0), (size, 0.5, size))
 
     def finish(self) -> Mesh:
         """All parts as one mesh."""

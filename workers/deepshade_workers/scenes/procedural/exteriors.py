@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepshade_workers.scenes.mesh import Mesh
 from deepshade_workers.scenes.procedural.assembly import Assembly
 from deepshade_workers.scenes.procedural.interiors import clutter
 from deepshade_workers.scenes.procedural.primitives import (
@@ -12,15 +11,15 @@ from deepshade_workers.scenes.procedural.primitives import (
     cylinder,
     lathe,
     place,
+    sphere,
     torus,
     tube,
     turn_y,
 )
 
 
-def colonnade(rng: Rng) -> Mesh:
+def colonnade(a: Assembly, rng: Rng) -> None:
     """Columns and arches on a stepped base, with a wall behind and mouldings above."""
-    a = Assembly(rng)
     count, gap, high = int(rng.integers(4, 9)), rng.uniform(0.9, 1.8), rng.uniform(2, 4)
     thick = rng.uniform(0.2, 0.5)
     length = count * gap
@@ -41,17 +40,13 @@ def colonnade(rng: Rng) -> Mesh:
             at = (i * gap - length / 2, base, 0.7 - row * 1.2)
             a.add(column, place(at, (thick, high, thick)))
     arches = rng.random() < 0.6
-    for i in range(count):
+    for i in range(count if arches else 0):
         center = (i + 0.5) * gap - length / 2
-        if arches:
-            segments = 10
-            for k in range(segments):
-                t = np.pi * (k + 0.5) / segments
-                x, y = gap / 2 * np.cos(t), gap / 2 * np.sin(t)
-                turn = np.array(
-                    [[-np.sin(t), np.cos(t), 0], [np.cos(t), np.sin(t), 0], [0, 0, -1.0]]
-                )
-                a.box((center + x, base + high + y, 0.7), (gap * 0.2, 0.2, thick), turn)
+        for angle in np.pi * (np.arange(10) + 0.5) / 10:
+            s, c = np.sin(angle), np.cos(angle)
+            turn = np.array([[-s, c, 0], [c, s, 0], [0, 0, -1.0]])
+            at = (center + gap / 2 * c, base + high + gap / 2 * s, 0.7)
+            a.box(at, (gap * 0.2, 0.2, thick), turn)
     top = base + high + (gap / 2 + 0.1 if arches else 0)
     for i in range(3):
         a.span(
@@ -64,12 +59,10 @@ def colonnade(rng: Rng) -> Mesh:
         x = (i + 0.5) * gap - length / 2
         a.span((x - 0.2, base + 0.4, -2.32), (x + 0.2, base + high * 0.6, -2.2))
     clutter(a, np.array([0.0, base, 0]), length / 3, 6)
-    return a.finish()
 
 
-def town(rng: Rng) -> Mesh:
+def town(a: Assembly, rng: Rng) -> None:
     """Blocks of buildings with windows, ledges and pitched roofs along narrow streets."""
-    a = Assembly(rng)
     a.floor(30)
     cells = int(rng.integers(4, 7))
     pitch = rng.uniform(2, 3)
@@ -91,25 +84,18 @@ def town(rng: Rng) -> Mesh:
                     a.box((x + u, y - 0.15, z + d / 2), (w / bays * 0.6, 0.05, proud * 3))
                     a.box((x + u, y, z - d / 2), (w / bays * 0.5, h / floors * 0.5, proud * 2))
             if rng.random() < 0.5:
-                a.add(
-                    cylinder(4),
-                    place((x, h, z), 1, turn_y(np.pi / 4)) @ place(size=(w * 1.45, 0.01, d * 1.45)),
-                )
+                eighth, eaves = turn_y(np.pi / 4), (w * 1.45, 0.01, d * 1.45)
+                a.add(cylinder(4), place((x, h, z), 1, eighth) @ place(size=eaves))
                 roof = lathe(np.array([[0, 0], [0.75, 0], [0, rng.uniform(0.3, 0.9)]]), 4)
-                a.add(
-                    roof,
-                    place((x, h, z), (w, 1, d), None) @ place(size=1, rotation=turn_y(np.pi / 4)),
-                )
+                a.add(roof, place((x, h, z), (w, 1, d)) @ place(rotation=eighth))
             else:
                 for _ in range(3):
                     at = (x + rng.uniform(-0.3, 0.3) * w, h + 0.15, z + rng.uniform(-0.3, 0.3) * d)
                     a.box(at, rng.uniform(0.1, 0.5, 3))
-    return a.finish()
 
 
-def fences(rng: Rng) -> Mesh:
+def fences(a: Assembly, rng: Rng) -> None:
     """Grids, railings, louvres and lattices over boxes and a floor."""
-    a = Assembly(rng)
     a.floor(18)
     for _ in range(int(rng.integers(3, 7))):
         a.paint()
@@ -118,13 +104,14 @@ def fences(rng: Rng) -> Mesh:
         wide, high = rng.uniform(1.5, 4), rng.uniform(0.7, 2.4)
         gap, thick = rng.uniform(0.08, 0.4), rng.uniform(0.015, 0.08)
         kind = rng.integers(4)
+        part = a.boxes_at(at, turn)
         for x in np.arange(-wide / 2, wide / 2, gap):
             if kind == 3:
                 lean = turn @ np.array([[0.7, -0.7, 0], [0.7, 0.7, 0], [0, 0, 1.0]])
                 a.box(at + turn @ np.array([x, high / 2, 0]), (thick, high * 1.2, thick), lean)
                 a.box(at + turn @ np.array([x, high / 2, thick]), (high * 1.2, thick, thick), lean)
             elif kind < 2:
-                a.box(at + turn @ np.array([x, high / 2, 0]), (thick, high, thick), turn)
+                part((x, high / 2, 0), (thick, high, thick))
         if kind != 3:
             tilt = turn @ np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]])
             depth = thick if kind == 0 else gap * 0.9
@@ -133,16 +120,14 @@ def fences(rng: Rng) -> Mesh:
                 size = (wide, thick, depth if kind == 2 else thick)
                 a.box(at + turn @ np.array([0, y, 0]), size, rotation)
         for x in (-wide / 2, wide / 2):
-            a.box(at + turn @ np.array([x, high / 2, 0]), (0.1, high * 1.05, 0.1), turn)
+            part((x, high / 2, 0), (0.1, high * 1.05, 0.1))
     clutter(a, np.zeros(3), 2.5, 14)
     if rng.random() < 0.5:
         a.span((-4, 0, -3.2), (4, 3, -3))
-    return a.finish()
 
 
-def pipes(rng: Rng) -> Mesh:
+def pipes(a: Assembly, rng: Rng) -> None:
     """Pipes that wander along a grid, with flanges, between walls."""
-    a = Assembly(rng)
     a.floor(14)
     a.span((-4, 0, -2.2), (4, 4, -2))
     if rng.random() < 0.5:
@@ -159,7 +144,7 @@ def pipes(rng: Rng) -> Mesh:
             if np.linalg.norm(end - at) < 0.1:
                 continue
             a.bar(at, end, thick, sides)
-            a.ball(end, thick)
+            a.add(sphere(2), place(end, thick))
             if rng.random() < 0.4:
                 middle = (at + end) / 2
                 a.bar(middle, middle + 0.05 * (end - at), thick * 1.4, sides)
@@ -174,12 +159,10 @@ def pipes(rng: Rng) -> Mesh:
             + t**3 * knots[3]
         )
         a.add(tube(curve, rng.uniform(0.02, 0.1)))
-    return a.finish()
 
 
-def machines(rng: Rng) -> Mesh:
+def machines(a: Assembly, rng: Rng) -> None:
     """Panels covered with nested boxes, bolts, rings and grooves."""
-    a = Assembly(rng)
     panels = [(np.eye(3), np.zeros(3))]
     if rng.random() < 0.6:
         panels.append((np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0.0]]), np.array([0, 3.0, -3])))
@@ -205,4 +188,3 @@ def machines(rng: Rng) -> Mesh:
                 a.add(cylinder(int(rng.choice([6, 24]))), place(center, size, turn))
             else:
                 a.add(torus(0.2), place(center, (size[0], size[0], size[0]), turn))
-    return a.finish()

@@ -27,8 +27,7 @@ def shell(a: Assembly, width: float, height: float, depth: float, wall: float = 
     for axis, at, span in ((0, -x, z), (0, x, z), (2, -z, x), (2, z, x)):
         out = at + np.sign(at) * wall
         low, high = sorted((at, out))
-        opening = rng.random() < 0.6
-        if not opening:
+        if rng.random() >= 0.6:
             _wall(a, axis, low, high, -span - wall, span + wall, 0, height)
             continue
         left = rng.uniform(-0.8, 0.2) * span
@@ -117,16 +116,11 @@ def sofa(a: Assembly, at: Floats, angle: float, width: float) -> None:
     seats = int(rng.integers(2, 4))
     for i in range(seats):
         x = width * ((i + 0.5) / seats - 0.5)
-        a.add(
-            random_cushion(),
-            place(at + turn @ np.array([x, 0.47, 0.05]), 1, turn)
-            @ place(size=(width / seats * 0.97, 0.18, 0.7)),
-        )
-        a.add(
-            random_cushion(),
-            place(at + turn @ np.array([x, 0.72, -0.2]), 1, turn)
-            @ place(size=(width / seats * 0.9, 0.45, 0.18)),
-        )
+        flat = (x, 0.47, 0.05), (width / seats * 0.97, 0.18, 0.7)
+        upright = (x, 0.72, -0.2), (width / seats * 0.9, 0.45, 0.18)
+        for offset, size in (flat, upright):
+            placed = place(at + turn @ np.array(offset), 1, turn)
+            a.add(random_cushion(), placed @ place(size=size))
 
 
 def random_cushion() -> Mesh:
@@ -184,9 +178,8 @@ def clutter(a: Assembly, at: Floats, spread: float, count: int) -> None:
             a.add(random_solid(rng), place(at + np.array([x, size / 2, z]), size))
 
 
-def room(rng: Rng) -> Mesh:
+def room(a: Assembly, rng: Rng) -> None:
     """A furnished room, seen from inside."""
-    a = Assembly(rng)
     width, depth, height = rng.uniform(3.5, 8), rng.uniform(3.5, 8), rng.uniform(2.3, 3.5)
     shell(a, width, height, depth)
     for _ in range(int(rng.integers(5, 14))):
@@ -204,7 +197,6 @@ def room(rng: Rng) -> Mesh:
     if rng.random() < 0.4:
         for x in np.arange(-width / 2, width / 2, rng.uniform(0.6, 1.2)):
             a.span((x, height - 0.2, -depth / 2), (x + 0.14, height, depth / 2))
-    return a.finish()
 
 
 def furnish(a: Assembly, at: Floats) -> None:
@@ -229,9 +221,8 @@ def furnish(a: Assembly, at: Floats) -> None:
         clutter(a, at, 0.6, int(rng.integers(2, 8)))
 
 
-def furniture(rng: Rng) -> Mesh:
+def furniture(a: Assembly, rng: Rng) -> None:
     """Furniture crowded and stacked on an open floor."""
-    a = Assembly(rng)
     a.floor(16)
     spots = rng.uniform(-2.2, 2.2, (int(rng.integers(10, 24)), 2))
     for x, z in spots:
@@ -240,12 +231,10 @@ def furniture(rng: Rng) -> Mesh:
         if level:
             a.box((x, level / 2, z), (1.0, level, 1.0))
         furnish(a, np.array([x, level, z]))
-    return a.finish()
 
 
-def stairs(rng: Rng) -> Mesh:
+def stairs(a: Assembly, rng: Rng) -> None:
     """Straight and spiral stairs with landings and railings."""
-    a = Assembly(rng)
     a.floor(20)
     steps = int(rng.integers(8, 20))
     rise, run = rng.uniform(0.14, 0.22), rng.uniform(0.22, 0.4)
@@ -275,12 +264,10 @@ def stairs(rng: Rng) -> Mesh:
         if rng.random() < 0.7:
             a.span((wide / 2 + 0.02, 0, -8), (wide / 2 + 0.3, steps * rise + 2, 2))
     clutter(a, np.array([0.0, 0, 1]), 2, 8)
-    return a.finish()
 
 
-def level(rng: Rng) -> Mesh:
+def level(a: Assembly, rng: Rng) -> None:
     """A game-like level: a maze of rooms with floors and ceilings at several heights."""
-    a = Assembly(rng)
     cells, size = int(rng.integers(7, 12)), rng.uniform(1.2, 2.5)
     floor = np.round(rng.uniform(0, 4, (cells, cells))) * 0.35
     solid = rng.random((cells, cells)) < 0.28
@@ -298,7 +285,6 @@ def level(rng: Rng) -> Mesh:
     for s in (-1, 1):
         a.span((s * wall, -1, -wall), (s * (wall + 0.3), 5.5, wall))
         a.span((-wall, -1, s * wall), (wall, 5.5, s * (wall + 0.3)))
-    return a.finish()
 
 
 def _fixture(a: Assembly, x: float, y: float, z: float, size: float) -> None:

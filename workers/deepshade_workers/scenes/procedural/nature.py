@@ -14,6 +14,7 @@ from deepshade_workers.scenes.procedural.primitives import (
     blob,
     cone,
     noise,
+    over_plane,
     place,
     random_rotation,
     random_solid,
@@ -50,9 +51,9 @@ def _bush(a: Assembly, at: Floats, size: float, leaves: int) -> None:
     rng = a.rng
     shapes = [leaf(rng) for _ in range(3)]
     branches = int(rng.integers(3, 9))
+    t = np.linspace(0, 1, 8)[:, None]
     for _ in range(branches):
         up = np.array([*rng.normal(0, 0.6, 2), 0])[[0, 2, 1]] + np.array([0, 1.0, 0])
-        t = np.linspace(0, 1, 8)[:, None]
         bend = rng.normal(0, 0.3, 3)
         path = at + size * (t * up + t**2 * bend)
         a.add(tube(path, size * rng.uniform(0.008, 0.025), 6))
@@ -61,28 +62,26 @@ def _bush(a: Assembly, at: Floats, size: float, leaves: int) -> None:
             foot = at + size * (k * up + k**2 * bend)
             direction = rng.normal(size=3) + np.array([0, 0.4, 0])
             length = size * rng.uniform(0.1, 0.35)
-            shape = shapes[int(rng.integers(3))]
-            a.add(shape, place(foot, length, _aim(rng, direction)))
+            a.add(shapes[int(rng.integers(3))], place(foot, length, _aim(rng, direction)))
 
 
-def foliage(rng: Rng) -> Mesh:
+def foliage(a: Assembly, rng: Rng) -> None:
     """Bushes, grass and pots: thin leaves over uneven ground."""
-    a = Assembly(rng)
     wave = noise(rng, 3, 0.08)
 
     def height(x: Floats, z: Floats) -> Floats:
-        return 0.3 * wave(np.stack([x, 0 * x, z], -1).reshape(-1, 3)).reshape(x.shape)
+        return 0.3 * over_plane(wave, x, z)
 
     a.add(sheet(height, 48, 14))
     for _ in range(int(rng.integers(3, 9))):
         a.paint()
         x, z = rng.uniform(-1.8, 1.8, 2)
-        ground = float(height(np.array([x]), np.array([z]))[0])
+        ground = float(height(x, z))
         _bush(a, np.array([x, ground, z]), rng.uniform(0.6, 2.2), int(rng.integers(40, 130)))
     a.paint()
     blades = [leaf(rng) for _ in range(4)]
     for x, z in rng.uniform(-3, 3, (int(rng.integers(0, 350)), 2)):
-        ground = float(height(np.array([x]), np.array([z]))[0])
+        ground = float(height(x, z))
         aim = _aim(rng, np.array([rng.normal(0, 0.4), 1, rng.normal(0, 0.4)]))
         high = rng.uniform(0.15, 0.6)
         a.add(blades[int(rng.integers(4))], place((x, ground, z), (high * 0.4, high, high), aim))
@@ -92,15 +91,12 @@ def foliage(rng: Rng) -> Mesh:
         a.add(rock(rng), place((x, 0.1, z), rng.uniform(0.2, 0.8, 3), random_rotation(rng)))
     if rng.random() < 0.4:
         a.span((-5, -1, -3), (5, 3, -2.7))
-    return a.finish()
 
 
-def rubble(rng: Rng) -> Mesh:
+def rubble(a: Assembly, rng: Rng) -> None:
     """A pile of rocks, planks and broken blocks."""
-    a = Assembly(rng)
     a.floor(16)
-    count = int(rng.integers(60, 200))
-    spread = rng.uniform(0.8, 2)
+    count, spread = int(rng.integers(60, 200)), rng.uniform(0.8, 2)
     for _ in range(count):
         if rng.random() < 0.15:
             a.paint()
@@ -116,24 +112,22 @@ def rubble(rng: Rng) -> Mesh:
             a.add(shape, place(at, size, random_rotation(rng)))
     if rng.random() < 0.4:
         a.span((-4, 0, -2.4), (4, 3, -2.2))
-    return a.finish()
 
 
-def terrain(rng: Rng) -> Mesh:
+def terrain(a: Assembly, rng: Rng) -> None:
     """Hills and ravines with boulders and cone trees."""
-    a = Assembly(rng)
     wave = noise(rng, 6, rng.uniform(0.05, 0.12))
     relief, ridged = rng.uniform(1, 3), rng.random() < 0.5
 
     def height(x: Floats, z: Floats) -> Floats:
-        value = wave(np.stack([x, 0 * x, z], -1).reshape(-1, 3)).reshape(x.shape)
+        value = over_plane(wave, x, z)
         return np.asarray(relief * (1 - 2 * np.abs(value) if ridged else value))
 
     a.add(sheet(height, 160, 14))
     for _ in range(int(rng.integers(10, 60))):
         a.paint()
         x, z = rng.uniform(-5, 5, 2)
-        ground = float(height(np.array([x]), np.array([z]))[0])
+        ground = float(height(x, z))
         if rng.random() < 0.6:
             size = rng.uniform(0.15, 0.9, 3)
             a.add(rock(rng), place((x, ground, z), size, random_rotation(rng)))
@@ -144,12 +138,10 @@ def terrain(rng: Rng) -> Mesh:
                 at = (x, ground + high * (0.45 + 0.25 * k), z)
                 wide = high * (0.55 - 0.13 * k)
                 a.add(cone(12), place(at, (wide, high * 0.4, wide)))
-    return a.finish()
 
 
-def cave(rng: Rng) -> Mesh:
+def cave(a: Assembly, rng: Rng) -> None:
     """The inside of a rough hollow, with boulders and stalagmites."""
-    a = Assembly(rng)
     hollow = blob(rng, rng.uniform(0.3, 0.7), detail=5, creased=rng.random() < 0.4)
     inside = replace(hollow.flipped(), normals=-hollow.normals[:, ::-1])
     a.add(inside, place(size=(9, 6, 9)))
@@ -166,12 +158,10 @@ def cave(rng: Rng) -> Mesh:
             a.add(cone(10), place(at, size * np.array([0.4, 1, 0.4]), flip))
         else:
             a.add(rock(rng), place(at, size, random_rotation(rng)))
-    return a.finish()
 
 
-def blobs(rng: Rng) -> Mesh:
+def blobs(a: Assembly, rng: Rng) -> None:
     """Smooth and creased lumps, touching each other and the ground."""
-    a = Assembly(rng)
     if rng.random() < 0.8:
         a.floor(14)
     for _ in range(int(rng.integers(2, 12))):
@@ -180,12 +170,10 @@ def blobs(rng: Rng) -> Mesh:
         at = np.array([*rng.normal(0, 1.1, 2), 0])[[0, 2, 1]] + np.array([0, 0.4 * size, 0])
         lump = blob(rng, rng.uniform(0.2, 1.2), detail=5, creased=rng.random() < 0.5)
         a.add(lump, place(at, size * rng.uniform(0.6, 1, 3), random_rotation(rng)))
-    return a.finish()
 
 
-def scattered(rng: Rng) -> Mesh:
+def scattered(a: Assembly, rng: Rng) -> None:
     """Random solids in the air and on the floor, sometimes very many."""
-    a = Assembly(rng)
     if rng.random() < 0.75:
         a.floor(14)
     count = int(2 ** rng.uniform(4, 8))
@@ -198,29 +186,25 @@ def scattered(rng: Rng) -> Mesh:
             at[1] = 0.2
         size = 2.5 * count ** (-1 / 3) * rng.uniform(0.2, 1.2) * rng.uniform(0.5, 1, 3)
         a.add(random_solid(rng), place(at, size, random_rotation(rng)))
-    return a.finish()
 
 
-def figures(rng: Rng) -> Mesh:
+def figures(a: Assembly, rng: Rng) -> None:
     """Animal-like figures of rounded limbs, alone or in a group, with or without ground."""
-    a = Assembly(rng)
     if rng.random() < 0.6:
         a.floor(14)
     for _ in range(int(rng.integers(1, 5))):
         a.paint()
         x, z = rng.normal(0, 1.2, 2)
         _figure(a, np.array([x, 0, z]), turn_y(rng.uniform(0, 6.3)), rng.uniform(0.8, 2))
-    return a.finish()
 
 
 def _figure(a: Assembly, at: Floats, turn: Floats, size: float) -> None:
     """A body, a head with ears and snout, legs and a tail."""
     rng = a.rng
 
-    def lump(center: Floats, extent: Floats, tilt: Floats | None = None) -> None:
-        rotation = turn if tilt is None else turn @ tilt
-        shape = blob(rng, rng.uniform(0.05, 0.35), detail=4)
-        a.add(shape, place(at + turn @ (center * size), extent * size, rotation))
+    def lump(center: Floats, extent: Floats) -> None:
+        shape = blob(rng, rng.uniform(0.05, 0.35))
+        a.add(shape, place(at + turn @ (center * size), extent * size, turn))
 
     leg, long, thick = rng.uniform(0.15, 0.6), rng.uniform(0.5, 1.2), rng.uniform(0.3, 0.7)
     lump(np.array([0, leg + thick / 2, 0]), np.array([thick, thick, long]))
@@ -237,16 +221,14 @@ def _figure(a: Assembly, at: Floats, turn: Floats, size: float) -> None:
             lump(foot - np.array([0, leg * 0.45, -0.05]), np.array([0.3, 0.15, 0.42]) * thick)
     t = np.linspace(0, 1, 24)[:, None]
     curl = rng.uniform(-1, 1, 3) * 0.6
-    tail = (
-        np.array([0, leg + thick * 0.6, -long * 0.45]) + t * np.array([0, 0.2, -0.5]) + t**2 * curl
-    )
+    root = np.array([0, leg + thick * 0.6, -long * 0.45])
+    tail = root + t * np.array([0, 0.2, -0.5]) + t**2 * curl
     path = at + (tail * size) @ turn.T
     a.add(tube(path, 0.06 * size * rng.uniform(0.5, 1.3)))
 
 
-def drapery(rng: Rng) -> Mesh:
+def drapery(a: Assembly, rng: Rng) -> None:
     """Hanging and lying cloth with folds, over things."""
-    a = Assembly(rng)
     a.floor(14)
     for _ in range(int(rng.integers(2, 6))):
         a.paint()
@@ -259,17 +241,14 @@ def drapery(rng: Rng) -> Mesh:
     wave = noise(rng, 4, 0.4)
     u = np.linspace(-1.2, 1.2, 60)
     uu, vv = np.meshgrid(u, u)
-    ripple = wave(np.stack([uu, 0 * uu, vv], -1).reshape(-1, 3)).reshape(uu.shape)
-    cloth = slab(np.stack([uu, 0.35 + 0.25 * ripple, vv], -1), 0.02)
+    cloth = slab(np.stack([uu, 0.35 + 0.25 * over_plane(wave, uu, vv), vv], -1), 0.02)
     a.paint()
     a.add(cloth, place((rng.uniform(-1, 1), 0.1, rng.uniform(-1, 1)), rng.uniform(0.7, 1.6)))
     clutter(a, np.zeros(3), 2, 10)
-    return a.finish()
 
 
-def crockery(rng: Rng) -> Mesh:
+def crockery(a: Assembly, rng: Rng) -> None:
     """Bowls, cups, vases and plates close together on a table, seen from near."""
-    a = Assembly(rng)
     a.floor(8)
     a.paint()
     for _ in range(int(rng.integers(6, 22))):
@@ -281,4 +260,3 @@ def crockery(rng: Rng) -> Mesh:
     clutter(a, np.zeros(3), 1.5, 8)
     if rng.random() < 0.3:
         a.span((-3, 0, -2), (3, 2, -1.8))
-    return a.finish()

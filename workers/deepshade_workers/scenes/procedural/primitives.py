@@ -160,6 +160,11 @@ def noise(rng: Rng, octaves: int = 4, frequency: float = 1.0) -> Callable[[Float
     return evaluate
 
 
+def over_plane(wave: Callable[[Floats], Floats], x: Floats, z: Floats) -> Floats:
+    """`noise` at the points (x, 0, z), in the shape of `x`."""
+    return wave(np.stack([x, 0 * x, z], -1).reshape(-1, 3)).reshape(x.shape)
+
+
 def blob(rng: Rng, roughness: float, *, detail: int = 4, creased: bool = False) -> Mesh:
     """A noise-displaced ball of diameter about 1; `creased` folds the noise into ridges."""
     solid = trimesh.creation.icosphere(subdivisions=detail, radius=0.5)
