@@ -19,10 +19,6 @@ from deepshade_client.request import Options
 class UsageError(ClientError):
     """The inputs and the output don't go together; nothing was sent."""
 
-    def __init__(self, detail: str, fix: str = "") -> None:
-        super().__init__(detail)
-        self.fix = fix
-
 
 @dataclass(frozen=True, slots=True)
 class Task:
@@ -76,7 +72,7 @@ def plan(
         if Path(out).suffix.lower() in (".exr", ".png") and not is_folder:
             raise UsageError(
                 f"{len(found)} pictures can't all go to the file {out}",
-                "name a folder (with a / at its end), or a pattern such as 'out/{name}_ao.exr'",
+                fix="name a folder (with a / at its end), or a pattern such as 'out/{name}_ao.exr'",
             )
         targets = [Path(out, relative).with_suffix(suffix) for relative in found.values()]
     else:
@@ -166,7 +162,7 @@ def _fill(pattern: str, source: Path, effect: str) -> Path:
     except (KeyError, IndexError, ValueError) as error:
         raise UsageError(
             f"the output pattern '{pattern}' can't be filled in: {error!r}",
-            "it may hold {name} and {effect}",
+            fix="it may hold {name} and {effect}",
         ) from error
 
 
@@ -178,12 +174,12 @@ def _check_targets(tasks: Sequence[Task], inputs: set[Path]) -> None:
         if target in originals:
             raise UsageError(
                 f"{task.target} is an input; it would be overwritten",
-                "choose another output, for example a pattern such as '{name}_ao.exr'",
+                fix="choose another output, for example a pattern such as '{name}_ao.exr'",
             )
         if target in seen:
             raise UsageError(
                 f"{task.sources[0]} and {seen[target].sources[0]} would both go to {task.target}",
-                "use a folder as the input, which keeps subfolders apart, or other names",
+                fix="use a folder as the input, which keeps subfolders apart, or other names",
             )
         if target.is_dir():
             raise UsageError(f"the output {task.target} is a folder")

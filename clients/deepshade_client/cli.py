@@ -9,32 +9,13 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
-from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from deepshade.cli import run
-from deepshade_client.exceptions import ClientError, NotReady, TransportError
+from deepshade_client.exceptions import NotReady, TransportError
 from deepshade_client.settings import DEFAULT_SERVER
-
-
-class Quality(StrEnum):
-    """What `--quality` may be."""
-
-    fast = "fast"
-    balanced = "balanced"
-    best = "best"
-
-
-class Precision(StrEnum):
-    """What `--precision` may be."""
-
-    fp32 = "fp32"
-    bf16 = "bf16"
-    fp16 = "fp16"
-    int8 = "int8"
-
 
 app = typer.Typer(
     help="Shade G-buffers through a running deepshade service.",
@@ -44,8 +25,7 @@ app = typer.Typer(
 )
 
 Server = Annotated[
-    str,
-    typer.Option("--server", envvar="DEEPSHADE_SERVER", help="Address of the service."),
+    str, typer.Option("--server", envvar="DEEPSHADE_SERVER", help="Address of the service.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output on stdout.")]
 
@@ -58,11 +38,7 @@ def shade(
     ],
     out: Annotated[
         str | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="A file, a folder, or a pattern with {name} and {effect}.",
-        ),
+        typer.Option("--out", "-o", help="A file, folder, or pattern with {name} and {effect}."),
     ] = None,
     radius: Annotated[float | None, typer.Option(help="Effect radius, scene units.")] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
@@ -73,11 +49,11 @@ def shade(
     profile: Annotated[str | None, typer.Option(help="Renderer whose names to expect.")] = None,
     bundle: Annotated[str | None, typer.Option(help="Which of the effect's bundles.")] = None,
     quality: Annotated[
-        Quality | None, typer.Option(help="The bundle of that name.", case_sensitive=False)
+        Literal["fast", "balanced", "best"] | None,
+        typer.Option(help="The bundle of that name.", case_sensitive=False),
     ] = None,
     max_error: Annotated[
-        float | None,
-        typer.Option(help="The fastest bundle with at most this error (DSSIM)."),
+        float | None, typer.Option(help="The fastest bundle with at most this error (DSSIM).")
     ] = None,
     budget_ms: Annotated[
         float | None,
@@ -85,7 +61,8 @@ def shade(
     ] = None,
     engine: Annotated[str | None, typer.Option(help="What it must run on, as openvino.")] = None,
     precision: Annotated[
-        Precision | None, typer.Option(help="How exactly it must calculate.")
+        Literal["fp32", "bf16", "fp16", "int8"] | None,
+        typer.Option(help="How exactly it must calculate."),
     ] = None,
     explain: Annotated[
         bool, typer.Option("--explain", help="Print the plan as JSON; shade and save nothing.")
@@ -118,16 +95,15 @@ def shade(
         profile=profile,
         mapping=parse_mapping(map_ or []),
         bundle=bundle,
-        quality=quality.value if quality else None,
+        quality=quality,
         max_error=max_error,
         budget_ms=budget_ms,
         engine=engine,
-        precision=precision.value if precision else None,
+        precision=precision,
         format="png" if png else "exr",
         compression=compression,
         half=False if full else None,
     )
-
     retry, wait = Retry(attempts=retries + 1), Timeout(answer=timeout)
     if explain:
         with Client(server, retry=retry, timeout=wait) as client:
@@ -141,7 +117,7 @@ def shade(
         _print_json({"pictures": plans})
         return
     if out is None:
-        raise batch.UsageError("where shall the answers go?", "name a file or folder: --out")
+        raise batch.UsageError("where shall the answers go?", fix="name a file or folder: --out")
     tasks = batch.plan(
         inputs, out, effect=effect, suffix=".png" if png else ".exr", together=together
     )
@@ -155,49 +131,32 @@ def shade(
     if as_json:
         _print_json(report.as_json(tasks, results))
     failed = [result.error for result in results if result.error]
-    if failed and all(isinstance(error, TransportError | NotReady) for error in failed):
-        raise typer.Exit(3)
     if failed:
-        raise typer.Exit(1)
+        unreached = all(isinstance(error, TransportError | NotReady) for error in failed)
+        raise typer.Exit(3 if unreached else 1)
 
 
 @app.command()
 def effects(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
     """List the effects, their inputs, and which of them the service can shade."""
-    from deepshade_client import report
+    from deepshade_client.report import print_effects
 
     found = _effects(server)
-    if as_json:
-        _print_json(found)
-    else:
-        report.print_effects(found)
+    (_print_json if as_json else print_effects)(found)
 
 
 @app.command()
 def models(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
     """List the model bundles that the service has loaded."""
-    from deepshade_client import report
+    from deepshade_client.report import print_models
 
-    found = [
-        {"effect": effect["name"], **bundle}
-        for effect in _effects(server)
-        for bundle in effect["bundles"]
-    ]
-    if as_json:
-        _print_json(found)
-    else:
-        report.print_models(found)
+    found = [{"effect": e["name"], **bundle} for e in _effects(server) for bundle in e["bundles"]]
+    (_print_json if as_json else print_models)(found)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code, and says on stderr what went wrong."""
-    try:
-        return run(typer.main.get_command(app), arguments, name="deepshade-client")
-    except ClientError as error:
-        print(f"error: {error}", file=sys.stderr)
-        if error.fix:
-            print(f"  fix: {error.fix}", file=sys.stderr)
-        return 3 if isinstance(error, TransportError | NotReady) else 2
+    return run(typer.main.get_command(app), arguments, name="deepshade-client")
 
 
 def _effects(server: str) -> list[dict[str, Any]]:

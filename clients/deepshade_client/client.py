@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import AbstractContextManager, asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import (
+    AbstractContextManager,
+    aclosing,
+    asynccontextmanager,
+    closing,
+    contextmanager,
+)
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import httpx
@@ -19,10 +24,9 @@ from deepshade_client.request import (
     Options,
     Picture,
     base_url,
-    explain_request,
     get_request,
     read_answer,
-    read_effects,
+    read_list,
     read_object,
     read_saved,
     shade_request,
@@ -61,7 +65,7 @@ class Client:
 
         Also raises OSError for a file that can't be read.
         """
-        return self._ask(shade_request(effect, picture, options or Options()), read_answer)
+        return self._ask(shade_request(effect, picture, options), read_answer)
 
     def shade_to(
         self, path: Path | str, effect: str, picture: Picture, options: Options | None = None
@@ -70,7 +74,7 @@ class Client:
 
         Missing folders are made; a file there is replaced only when all is written.
         """
-        request = shade_request(effect, picture, options or Options())
+        request = shade_request(effect, picture, options)
         return self._try(lambda: self._save(Path(path), request))
 
     def explain(
@@ -81,11 +85,11 @@ class Client:
         Which bundle on which engine, what of the picture would be computed, which channels are
         read; docs/service.md has an example. Also raises OSError for a file that can't be read.
         """
-        return self._ask(explain_request(effect, picture, options or Options()), read_object)
+        return self._ask(shade_request(effect, picture, options, explain=True), read_object)
 
     def effects(self) -> list[dict[str, Any]]:
         """Every effect: name, title, inputs, outputs, and its bundles."""
-        return self._ask(get_request("effects"), read_effects)
+        return self._ask(get_request("effects"), read_list)
 
     def effect(self, name: str) -> dict[str, Any]:
         """One effect, as in `effects`."""
@@ -102,27 +106,19 @@ class Client:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _ask(self, request: dict[str, Any], read: Callable[[httpx.Response], T]) -> T:
         def ask() -> T:
-            response = self._http.request(**request)
-            try:
+            with _released(self._http.request(**request)) as response:
                 return read(response)
-            finally:
-                _release(response)
 
         return self._try(ask)
 
     def _save(self, path: Path, request: dict[str, Any]) -> Saved:
         response = self._http.send(self._http.build_request(**request), stream=True)
-        try:
+        with _released(response), closing(response):
             if not response.is_success:
                 response.read()
             saved = read_saved(response, path)
@@ -131,9 +127,6 @@ class Client:
                 for chunk in response.iter_bytes():
                     file.write(chunk)
             return saved
-        finally:
-            response.close()
-            _release(response)
 
     def _try(self, ask: Callable[[], T]) -> T:
         attempt = 0
@@ -172,26 +165,26 @@ class AsyncClient:
 
     async def shade(self, effect: str, picture: Picture, options: Options | None = None) -> Answer:
         """Like `Client.shade`; files are read in a thread."""
-        request = await asyncio.to_thread(shade_request, effect, picture, options or Options())
+        request = await asyncio.to_thread(shade_request, effect, picture, options)
         return await self._ask(request, read_answer)
 
     async def shade_to(
         self, path: Path | str, effect: str, picture: Picture, options: Options | None = None
     ) -> Saved:
         """Like `Client.shade_to`; files are read and written in threads."""
-        request = await asyncio.to_thread(shade_request, effect, picture, options or Options())
+        request = await asyncio.to_thread(shade_request, effect, picture, options)
         return await self._try(lambda: self._save(Path(path), request))
 
     async def explain(
         self, effect: str, picture: Picture, options: Options | None = None
     ) -> dict[str, Any]:
         """Like `Client.explain`; files are read in a thread."""
-        request = await asyncio.to_thread(explain_request, effect, picture, options or Options())
+        request = await asyncio.to_thread(shade_request, effect, picture, options, explain=True)
         return await self._ask(request, read_object)
 
     async def effects(self) -> list[dict[str, Any]]:
         """Like `Client.effects`."""
-        return await self._ask(get_request("effects"), read_effects)
+        return await self._ask(get_request("effects"), read_list)
 
     async def effect(self, name: str) -> dict[str, Any]:
         """Like `Client.effect`."""
@@ -208,39 +201,29 @@ class AsyncClient:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *error: object) -> None:
         await self.close()
 
     async def _ask(self, request: dict[str, Any], read: Callable[[httpx.Response], T]) -> T:
         async def ask() -> T:
-            response = await self._http.request(**request)
-            try:
+            with _released(await self._http.request(**request)) as response:
                 return read(response)
-            finally:
-                _release(response)
 
         return await self._try(ask)
 
     async def _save(self, path: Path, request: dict[str, Any]) -> Saved:
         response = await self._http.send(self._http.build_request(**request), stream=True)
-        try:
-            if not response.is_success:
-                await response.aread()
-            saved = read_saved(response, path)
-            await asyncio.to_thread(path.parent.mkdir, parents=True, exist_ok=True)
-            async with _in_threads(replacing(path)) as temporary:
-                with temporary.open("wb") as file:
-                    async for chunk in response.aiter_bytes():
-                        await asyncio.to_thread(file.write, chunk)
-            return saved
-        finally:
-            await response.aclose()
-            _release(response)
+        with _released(response):
+            async with aclosing(response):
+                if not response.is_success:
+                    await response.aread()
+                saved = read_saved(response, path)
+                await asyncio.to_thread(path.parent.mkdir, parents=True, exist_ok=True)
+                async with _in_threads(replacing(path)) as temporary:
+                    with temporary.open("wb") as file:
+                        async for chunk in response.aiter_bytes():
+                            await asyncio.to_thread(file.write, chunk)
+                return saved
 
     async def _try(self, ask: Callable[[], Awaitable[T]]) -> T:
         attempt = 0
@@ -258,12 +241,16 @@ class AsyncClient:
             await asyncio.sleep(pause)
 
 
-def _release(response: httpx.Response) -> None:
-    """Breaks httpx's cycle of a response and its stream.
+@contextmanager
+def _released(response: httpx.Response) -> Iterator[httpx.Response]:
+    """A context that ends with breaking httpx's cycle of a response and its stream.
 
     Else the request's picture and the answer stay in memory until a garbage collection.
     """
-    response.stream = httpx.ByteStream(b"")
+    try:
+        yield response
+    finally:
+        response.stream = httpx.ByteStream(b"")
 
 
 @asynccontextmanager

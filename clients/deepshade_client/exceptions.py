@@ -19,15 +19,17 @@ from __future__ import annotations
 
 from typing import Any
 
+from deepshade.errors import DeepshadeError
 
-class ClientError(Exception):
+
+class ClientError(DeepshadeError):
     """The root of all errors here. `fix` says what to do about it, if anything is known."""
-
-    fix: str = ""
 
 
 class TransportError(ClientError):
     """The request didn't get through."""
+
+    exit_code = 3
 
 
 class ConnectionFailed(TransportError):
@@ -56,13 +58,12 @@ class ServerProblem(ClientError):
     """
 
     def __init__(self, status: int, document: dict[str, Any], retry_after: float | None = None):
+        detail = str(document.get("detail") or document.get("title") or f"HTTP {status}")
+        super().__init__(detail, fix=str(document.get("fix", "")))
         self.status = status
         self.document = document
-        self.detail = str(document.get("detail") or document.get("title") or f"HTTP {status}")
-        self.fix = str(document.get("fix", ""))
         self.kind = str(document.get("type", "")).rpartition(":")[2]
         self.retry_after = retry_after
-        super().__init__(self.detail)
 
 
 class BadRequest(ServerProblem):
@@ -99,6 +100,8 @@ class Busy(ServerProblem):
 class NotReady(ServerProblem):
     """The service has not loaded its models yet."""
 
+    exit_code = 3
+
 
 class ServerFailed(ServerProblem):
     """The service failed."""
@@ -110,11 +113,10 @@ class BadAnswer(ClientError):
 
 def problem(status: int, document: dict[str, Any], retry_after: float | None) -> ServerProblem:
     """The exception for a problem document."""
-    kind = str(document.get("type", "")).rpartition(":")[2]
-    if kind == "missing-attribute":
-        cls: type[ServerProblem] = MissingAttribute
-    else:
-        cls = {413: TooLarge, 429: Busy, 503: NotReady}.get(
-            status, ServerFailed if status >= 500 else BadRequest
-        )
+    cls = _OF_STATUS.get(status, ServerFailed if status >= 500 else BadRequest)
+    if str(document.get("type", "")).endswith(":missing-attribute"):
+        cls = MissingAttribute
     return cls(status, document, retry_after)
+
+
+_OF_STATUS: dict[int, type[ServerProblem]] = {413: TooLarge, 429: Busy, 503: NotReady}

@@ -5,9 +5,10 @@ from __future__ import annotations
 import email.utils
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -25,6 +26,8 @@ from deepshade_client.exceptions import (
 
 EXR = "image/x-exr"
 PNG = "image/png"
+
+T = TypeVar("T")
 
 Source = Path | str | bytes
 Picture = Source | Sequence[Source] | Mapping[str, Source]
@@ -52,52 +55,32 @@ class Options:
     budget_ms: float | None = None
     engine: str | None = None
     precision: str | None = None
-    format: Literal["exr", "png"] = "exr"
+    format: Literal["exr", "png"] | None = None
     compression: str | None = None
     half: bool | None = None
 
     def query(self) -> list[tuple[str, str]]:
         """As the parameters of the request."""
-        plain = {
-            "radius": _number(self.radius),
-            "fov": _number(self.fov),
-            "profile": self.profile,
-            "bundle": self.bundle,
-            "quality": self.quality,
-            "max_error": _number(self.max_error),
-            "budget_ms": _number(self.budget_ms),
-            "engine": self.engine,
-            "precision": self.precision,
-            "format": None if self.format == "exr" else self.format,
-            "compression": self.compression,
-            "half": None if self.half is None else str(self.half).lower(),
-        }
+        plain = asdict(replace(self, mapping=None))
         mapped = [("map", f"{name}={where}") for name, where in (self.mapping or {}).items()]
-        return [(name, value) for name, value in plain.items() if value is not None] + mapped
+        return [(name, _text(value)) for name, value in plain.items() if value is not None] + mapped
 
 
-def shade_request(effect: str, picture: Picture, options: Options) -> dict[str, Any]:
-    """The arguments of httpx's `request`; reads the files.
+def shade_request(
+    effect: str, picture: Picture, options: Options | None, *, explain: bool = False
+) -> dict[str, Any]:
+    """The arguments of httpx's `request`; reads the files. With `explain` it asks for the plan.
 
     One file is sent as the body, several as a form. Raises OSError for a file that can't be read.
     """
-    request: dict[str, Any] = {
-        "method": "POST",
-        "url": f"shade/{quote(effect, safe='')}",
-        "params": options.query(),
-    }
+    query = (options or Options()).query() + [("explain", "true")] * explain
+    request = {"method": "POST", "url": f"shade/{quote(effect, safe='')}", "params": query}
     if isinstance(picture, (str, bytes, Path)):
         _, data = _named(picture)
         return request | {"content": data, "headers": {"Content-Type": EXR}}
     named = picture.items() if isinstance(picture, Mapping) else [("image", s) for s in picture]
     files = [(field, (*_named(source), EXR)) for field, source in named]
     return request | {"files": files}
-
-
-def explain_request(effect: str, picture: Picture, options: Options) -> dict[str, Any]:
-    """The same for its plan: `shade_request`, but nothing is to be shaded."""
-    request = shade_request(effect, picture, options)
-    return request | {"params": [*request["params"], ("explain", "true")]}
 
 
 def read_answer(response: httpx.Response) -> Answer:
@@ -124,17 +107,14 @@ def base_url(server: str) -> httpx.URL:
     """The address that requests go below. Raises ClientError for what is none."""
     try:
         url = httpx.URL(server + "/")
+        if url.scheme not in ("http", "https") or not url.host:
+            raise ValueError("it must begin with http:// or https://")
     except (httpx.InvalidURL, ValueError) as error:
-        raise _no_address(server, str(error)) from None
-    if url.scheme not in ("http", "https") or not url.host:
-        raise _no_address(server, "it must begin with http:// or https://")
+        raise ClientError(
+            f"'{server}' is no address of a service: {error}",
+            fix="write it like http://127.0.0.1:8000",
+        ) from None
     return url
-
-
-def _no_address(server: str, why: str) -> ClientError:
-    error = ClientError(f"'{server}' is no address of a service: {why}")
-    error.fix = "write it like http://127.0.0.1:8000"
-    return error
 
 
 def get_request(*path: str) -> dict[str, Any]:
@@ -142,32 +122,29 @@ def get_request(*path: str) -> dict[str, Any]:
     return {"method": "GET", "url": "/".join(quote(step, safe="") for step in path)}
 
 
-def read_effects(response: httpx.Response) -> list[dict[str, Any]]:
-    """A list of effects. Raises ServerProblem, BadAnswer."""
-    effects = _json(response)
-    if not isinstance(effects, list):
-        raise BadAnswer("the answer is no list of effects; is this a deepshade service?")
-    return effects
+def read_list(response: httpx.Response) -> list[dict[str, Any]]:
+    """A list of objects, such as effects. Raises ServerProblem, BadAnswer."""
+    return _json(response, list)
 
 
 def read_object(response: httpx.Response) -> dict[str, Any]:
     """One object, such as an effect. Raises ServerProblem, BadAnswer."""
-    document = _json(response)
-    if not isinstance(document, dict):
-        raise BadAnswer("the answer is no JSON object; is this a deepshade service?")
-    return document
+    return _json(response, dict)
 
 
-def _number(value: float | None) -> str | None:
-    return None if value is None else repr(float(value))
+def _text(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _json(response: httpx.Response) -> Any:
+def _json(response: httpx.Response, kind: type[T]) -> T:
     check(response)
     try:
-        return response.json()
+        document = response.json()
     except ValueError as error:
         raise BadAnswer("the answer is no JSON; is this a deepshade service?") from error
+    if not isinstance(document, kind):
+        raise BadAnswer(f"the answer is no JSON {kind.__name__}; is this a deepshade service?")
+    return document
 
 
 def check(response: httpx.Response) -> None:
@@ -204,14 +181,9 @@ def _named(source: Source) -> tuple[str, bytes]:
 
 def _retry_after(response: httpx.Response) -> float | None:
     """Seconds, from a number or an HTTP date."""
-    value = response.headers.get("retry-after", "").strip()
-    if not value:
-        return None
-    try:
+    value = response.headers.get("retry-after", "")
+    with suppress(ValueError):
         return max(0.0, float(value))
-    except ValueError:
-        pass
-    try:
+    with suppress(ValueError):
         return max(0.0, email.utils.parsedate_to_datetime(value).timestamp() - time.time())
-    except ValueError:
-        return None
+    return None

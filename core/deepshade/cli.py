@@ -59,8 +59,8 @@ def application() -> Any:
 def run(command: Any, argv: Sequence[str] | None = None, *, name: str) -> int:
     """Runs a click command and turns what it raises into a message and an exit code.
 
-    2 for wrong usage or input, 1 for an aborted prompt, 130 for Ctrl-C, 141 when the reader of
-    our output went away.
+    2 for wrong usage or input, unless a DeepshadeError says otherwise; 1 for an aborted prompt,
+    130 for Ctrl-C, 141 when the reader of our output went away.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -68,15 +68,17 @@ def run(command: Any, argv: Sequence[str] | None = None, *, name: str) -> int:
         sys.stdout.flush()
         return result if isinstance(result, int) else 0
     except DeepshadeError as error:
-        return _complain(str(error), error.fix)
+        _complain(str(error), error.fix)
+        return error.exit_code
     except ModuleNotFoundError as error:
         extra = extra_of(error.name or "")
         if extra is None:
             raise
-        return _complain(
+        _complain(
             f"this needs the '{extra}' extra (no module '{error.name}')",
             f"pip install 'deepshade[{extra}]'",
         )
+        return 2
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
@@ -85,7 +87,8 @@ def run(command: Any, argv: Sequence[str] | None = None, *, name: str) -> int:
         return 141
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        return _complain(f"{where}{error.strerror or error}", "")
+        _complain(f"{where}{error.strerror or error}", "")
+        return 2
     except Exception as error:
         return _usage_error(error)
 
@@ -121,11 +124,10 @@ def _unavailable(error: Exception) -> Any:
     return command
 
 
-def _complain(message: str, fix: str) -> int:
+def _complain(message: str, fix: str) -> None:
     print(f"error: {message}", file=sys.stderr)
     if fix:
         print(f"  fix: {fix}", file=sys.stderr)
-    return 2
 
 
 def _usage_error(error: Exception) -> int:

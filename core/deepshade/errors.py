@@ -7,12 +7,18 @@ from collections.abc import Iterable, Mapping, Sequence
 
 
 class DeepshadeError(Exception):
-    """Something about the input or the set-up is wrong. `str()` says what, `.fix` what to do."""
+    """Something about the input or the set-up is wrong. `str()` says what, `.fix` what to do.
+
+    A command that it ends returns `exit_code`.
+    """
+
+    fix = ""
+    exit_code = 2
 
     def __init__(self, detail: str, *, fix: str = "") -> None:
         super().__init__(detail)
         self.detail = detail
-        self.fix = fix
+        self.fix = fix or type(self).fix
 
 
 class ImageError(DeepshadeError):
