@@ -34,14 +34,13 @@ def serve(
             " the models that came with the sources."
         ),
     ] = None,
-    calibration: Annotated[
-        str,
-        typer.Option(
-            help="File with what each engine and precision takes and costs here, measured in the"
-            " background where it says nothing; 'off' measures nothing and stays in fp32."
-            " Default: calibration.json in $XDG_CACHE_HOME/deepshade."
-        ),
-    ] = "",
+    engine: Annotated[
+        str | None,
+        typer.Option(help="What networks run on, as onnxruntime. Default: the first there is."),
+    ] = None,
+    precision: Annotated[
+        str | None, typer.Option(help="How they calculate, as fp32. Default: as the CPU does best.")
+    ] = None,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Of a network run. Default: the CPUs we may use.")
     ] = None,
@@ -73,8 +72,8 @@ def serve(
     from dataclasses import replace
 
     from deepshade.bundles import bundle_root
+    from deepshade.engines import choose
     from deepshade.errors import ConfigError
-    from deepshade_service.calibration import chosen_path
     from deepshade_service.config import Settings, default_limits
     from deepshade_service.memory import parse_size
 
@@ -83,6 +82,8 @@ def serve(
         raise ConfigError(
             "models", detail=f"there is no folder {models}; --models says where the bundles are"
         )
+    if engine or precision:
+        choose(engine, precision)  # a wrong one is said now, and not by every answer
     limits = {
         "body_bytes": parse_size(max_body) if max_body else None,
         "decoded_bytes": parse_size(max_decoded) if max_decoded else None,
@@ -94,7 +95,8 @@ def serve(
     chosen = {"threads": threads, "memory": parse_size(memory) if memory else None}
     settings = Settings(
         models=models,
-        calibration=chosen_path(calibration),
+        engine=engine,
+        precision=precision,
         limits=replace(
             default_limits(uploads),
             **{name: value for name, value in limits.items() if value is not None},

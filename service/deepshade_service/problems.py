@@ -11,7 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from deepshade.errors import DeepshadeError, LimitError
+from deepshade.errors import DeepshadeError, EngineError, LimitError
 from deepshade.problems import MEDIA_TYPE, facts_of, kind_of, type_uri
 
 # Which option of `deepshade serve` sets a limit: what its operator can do about it.
@@ -51,6 +51,8 @@ def from_error(error: DeepshadeError) -> Problem:
     """The problem that an error of the core package is, with the facts that it carries."""
     status, kind = kind_of(error)
     fix = error.fix
+    if isinstance(error, EngineError):  # what can't run here at all is refused before
+        status, kind = 500, "bad-bundle"
     if isinstance(error, LimitError) and error.limit in _OPTIONS:
         option = _OPTIONS[error.limit]
         fix = f"send a smaller picture, or start the service with a higher {option}"
