@@ -128,7 +128,7 @@ def _shade(
         content = json.dumps(made, indent=2).encode()
         return Shaded(content, "application/json", facts, 0, 0, watch)
     with watch.time("infer"):
-        shade = infer(gbuffer, plan, engine, cancelled, consume=True)
+        shade = infer(gbuffer, plan, engine, cancelled)
     with watch.time("encode"):
         content, media_type = encode(shade, gbuffer, asked, facts, made)
     return Shaded(content, media_type, facts, gbuffer.background.size, plan.computed, watch)
@@ -190,20 +190,11 @@ def plan_shading(
     return ShadePlan(radius, source, grid.shape, tiles)
 
 
-def infer(
-    gbuffer: GBuffer,
-    plan: ShadePlan,
-    engine: Engine,
-    cancelled: threading.Event,
-    *,
-    consume: bool = False,
-) -> Float:
+def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threading.Event) -> Float:
     """(C', H, W): the network's answer, and the effect's background where there is none.
 
-    A per-channel network runs once for each colour channel. `consume` allows to scale the
-    G-buffer's lengths in place, where that spares a copy of it; it is of no use afterwards.
-    Raises Cancelled between tiles when the event is set, and Problem 500 for an answer that isn't
-    finite.
+    A per-channel network runs once for each colour channel. Raises Cancelled between tiles when
+    the event is set, and Problem 500 for an answer that isn't finite.
     """
     bundle = engine.bundle
     effect = EFFECTS[bundle.effect]
@@ -211,8 +202,6 @@ def infer(
     shade = np.empty((len(effect.outputs), *gbuffer.shape), np.float32)
     for channel in range(3) if bundle.per_channel else (None,):
         planes = tensors.planes(gbuffer.attributes, bundle.inputs, scale, channel=channel)
-        if consume and channel is None and plan.shape == gbuffer.shape:
-            planes = _scaled(planes)
         out = shade if channel is None else shade[channel : channel + 1]
         for tile in plan.tiles:
             if cancelled.is_set():
@@ -263,14 +252,6 @@ def encode(
         origin=(x0 - left, y0 - top),
     )
     return stream.getvalue(), "image/x-exr"
-
-
-def _scaled(planes: Sequence[tensors.Plane]) -> list[tensors.Plane]:
-    """The same planes, scaled where they lie: nothing is left for `cut` to copy."""
-    for plane in planes:
-        if plane.divisor is not None:
-            tensors.scale(plane.pixels, plane.divisor, plane.pixels)
-    return [tensors.Plane(plane.pixels) for plane in planes]
 
 
 def _radius(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> tuple[float, str]:
