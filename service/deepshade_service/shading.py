@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -70,22 +70,30 @@ class Shader:
                 return read_headers(files, asked, self.limits)
 
         def work(cancelled: threading.Event) -> Shaded:
-            try:
-                return _shade(files, headers, selection, asked, need, engine, watch, cancelled)
-            finally:
-                if need.total > _BIG:
-                    if engine is not None:
-                        engine.shrink()
-                    trim()
+            if cancelled.is_set():
+                raise Cancelled
+            with watch.time("decode"):
+                gbuffer = decode(files, headers, bundle, asked, self.limits)
+            with watch.time("plan"):
+                plan = plan_shading(gbuffer, bundle, asked, need.max_pixels)
+                made = explain(gbuffer, headers, selection, asked, plan, need)
+                facts = facts_of(gbuffer, plan, made)
+            if engine is None:
+                content = json.dumps(made, indent=2).encode()
+                return Shaded(content, "application/json", facts, 0, 0, watch)
+            with watch.time("infer"):
+                shade = infer(gbuffer, plan, engine, cancelled)
+            with watch.time("encode"):
+                content, media_type = encode(shade, gbuffer, asked, facts, made)
+            return Shaded(content, media_type, facts, shade[0].size, plan.computed, watch)
 
         headers = await self.workers.run(read)
         selection = await self._select(headers, asked, bundles, backend)
-        need = need_of(headers, selection.bundle, self.memory.total)
-        engine = None
-        if not asked.explain:
-            engine = await self.models.engine(selection.bundle, selection.backend)
+        bundle = selection.bundle
+        need = need_of(headers, bundle, self.memory.total)
+        engine = None if asked.explain else await self.models.engine(bundle, backend)
         async with self.memory.hold(need.total):
-            return await self.workers.run(work)
+            return await self.workers.run(_tidy(work, need, engine))
 
     async def _select(
         self,
@@ -102,36 +110,6 @@ class Shader:
                 grid = plan_tiles(*size_of(headers), bundle.size_multiple, bundle.halo, most)
                 megapixels[bundle.name] = grid.computed / 1e6
         return await select(self.models, bundles, backend, asked, megapixels)
-
-
-def _shade(
-    files: Sequence[Upload],
-    headers: Sequence[exr.Header],
-    selection: Selection,
-    asked: ShadeParameters,
-    need: Need,
-    engine: Engine | None,
-    watch: Stopwatch,
-    cancelled: threading.Event,
-) -> Shaded:
-    """The four steps, on a worker's thread. Without an `engine` only the plan is made."""
-    bundle = selection.bundle
-    if cancelled.is_set():
-        raise Cancelled
-    with watch.time("decode"):
-        gbuffer = decode(files, headers, bundle, asked)
-    with watch.time("plan"):
-        plan = plan_shading(gbuffer, bundle, asked, need.max_pixels)
-        made = explain(gbuffer, headers, selection, asked, plan, need)
-        facts = facts_of(gbuffer, plan, made)
-    if engine is None:
-        content = json.dumps(made, indent=2).encode()
-        return Shaded(content, "application/json", facts, 0, 0, watch)
-    with watch.time("infer"):
-        shade = infer(gbuffer, plan, engine, cancelled)
-    with watch.time("encode"):
-        content, media_type = encode(shade, gbuffer, asked, facts, made)
-    return Shaded(content, media_type, facts, gbuffer.background.size, plan.computed, watch)
 
 
 def read_headers(
@@ -153,7 +131,7 @@ def decode(
     headers: Sequence[exr.Header],
     bundle: Bundle,
     asked: ShadeParameters,
-    limits: exr.Limits | None = None,
+    limits: exr.Limits,
 ) -> GBuffer:
     """The G-buffer that the bundle's network needs, found or derived in the files.
 
@@ -252,6 +230,23 @@ def encode(
         origin=(x0 - left, y0 - top),
     )
     return stream.getvalue(), "image/x-exr"
+
+
+def _tidy(
+    work: Callable[[threading.Event], Shaded], need: Need, engine: Engine | None
+) -> Callable[[threading.Event], Shaded]:
+    """The same work, after which memory is given back if it was much."""
+    if need.total <= _BIG or engine is None:
+        return work
+
+    def tidied(cancelled: threading.Event) -> Shaded:
+        try:
+            return work(cancelled)
+        finally:
+            engine.shrink()
+            trim()
+
+    return tidied
 
 
 def _radius(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> tuple[float, str]:

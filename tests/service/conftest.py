@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from deepshade import exr
 from deepshade.bundles import write_config
+from deepshade.engines import Engine
 from deepshade_service.app import Service, create_app
 from deepshade_service.cli import listen
 from deepshade_service.config import Settings
@@ -205,10 +208,23 @@ class Local:
         self._server = uvicorn.Server(config)
         listener = listen("127.0.0.1", 0)
         self.address = listener.getsockname()
-        self._thread = threading.Thread(target=self._server.run, args=([listener],))
+        self._thread = threading.Thread(target=asyncio.run, args=(self._serve(listener),))
         self._thread.start()
         url = f"http://127.0.0.1:{self.address[1]}"
         self.client = httpx.Client(base_url=url, trust_env=False, timeout=60)
+
+    async def _serve(self, listener: socket.socket) -> None:
+        self.loop = asyncio.get_running_loop()
+        await self._server.serve([listener])
+
+    def run(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """Run a coroutine on the service's event loop."""
+        return asyncio.run_coroutine_threadsafe(work, self.loop).result(30)
+
+    def engine(self, name: str = "tiny") -> Engine:
+        """The engine of that AO bundle, loaded if it isn't yet."""
+        (bundle,) = self.service.models.find("ao", name)
+        return self.run(self.service.models.engine(bundle, self.service.models.backend()))
 
     def wait(self, path: str = "/readyz") -> None:
         deadline = time.monotonic() + 30
@@ -235,6 +251,19 @@ def service(models: Path) -> Iterator[Local]:
 @pytest.fixture(scope="session")
 def client(service: Local) -> httpx.Client:
     return service.client
+
+
+def until(true: Callable[[], object]) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + 20
+    while not true():
+        assert time.monotonic() < deadline, "it doesn't come true"
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope="session")
+def wait_until() -> Callable[..., None]:
+    return until
 
 
 @pytest.fixture
