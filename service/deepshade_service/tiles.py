@@ -126,22 +126,20 @@ def _costs(length: int, multiple: int, halo: int) -> dict[int, int]:
     least = _side(4 * halo or 1, multiple)
     step = up(MIN_SIDE, multiple)
     smaller = (side for side in range(end - step, least - 1, -step) if side != 3 * step)
-    return {side: side * _count(end, side, halo) for side in (end, *smaller)}
-
-
-def _count(end: int, side: int, halo: int) -> int:
-    """How many tiles cover [0, end); neighbours share two halos."""
-    return 1 if side == end else 1 + math.ceil((end - side) / (side - 2 * halo))
+    return {side: side * len(_spans(length, side, multiple, halo)) for side in (end, *smaller)}
 
 
 def _spans(length: int, side: int, multiple: int, halo: int) -> tuple[Span, ...]:
-    """The last span ends where the padded picture ends; it overlaps more than the others."""
+    """Spans of one size that cover [0, length); neighbours share two halos.
+
+    A last one that would pass the end of the padded picture is shifted back to end there.
+    """
     end = _side(length, multiple)
-    spans, first = [], 0
-    for index in range(_count(end, side, halo)):
-        start = min(index * (side - 2 * halo), end - side)
-        last = length if start + side == end else start + side - halo
-        if first < min(last, length):  # else nothing but padding is left
-            spans.append(Span(start, start + side, first, min(last, length)))
-        first = last
+    spans: list[Span] = []
+    start = first = 0
+    while first < length:
+        stop = start + side
+        last = length if stop == end else min(stop - halo, length)
+        spans.append(Span(start, stop, first, last))
+        start, first = min(stop - 2 * halo, end - side), last
     return tuple(spans)

@@ -66,15 +66,14 @@ def test_no_grid_of_allowed_sides_computes_less(height, width, most):
         return {end: 1} | {s: 1 + -(-(end - s) // (s - 2 * halo)) for s in sides}
 
     tall, wide = counts(height), counts(width)
-    possible = [
-        h * tall[h] * w * wide[w] for h in tall for w in wide if h * w <= most
-    ]
+    possible = [h * tall[h] * w * wide[w] for h in tall for w in wide if h * w <= most]
     if possible:
         assert plan_tiles(height, width, 32, halo, most).computed <= min(possible)
 
 
 @pytest.mark.parametrize(
-    ("size", "most"), [((129, 257), 40_000), ((63, 565), 30_000), ((410, 40), 20_000), ((700, 700), 1)]
+    ("size", "most"),
+    [((129, 257), 40_000), ((63, 565), 30_000), ((410, 40), 20_000), ((700, 700), 1)],
 )
 def test_tiled_equals_untiled(service, make_exr, size, most):
     engine = service.engine()
