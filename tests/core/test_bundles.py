@@ -14,24 +14,25 @@ def folder(tmp_path):
     path = tmp_path / "models" / "ao" / "default"
     path.mkdir(parents=True)
     (path / "model.onnx").write_bytes(b"graph")
-    (path / "model.safetensors").write_bytes(b"weights")
     return path
 
 
 def make(folder, **changes):
-    settings = {
+    config = {
         "effect": "ao",
         "name": "default",
-        "inputs": ("normal", "position"),
-        "outputs": ("Y",),
+        "inputs": ["normal", "position"],
+        "outputs": ["Y"],
         "radius": 0.5,
         "fov": 50.0,
         "size_multiple": 64,
         "halo": 96,
-        "ranges": {"position": (-40.0, 40.0)},
-        "metrics": {"dssim": 0.1},
+        "bytes_per_pixel": 100,
+        "float32": ["t1"],
+        "network": {"kind": "fold"},
+        "ranges": {"position": [-40.0, 40.0]},
     } | changes
-    return write_config(folder, **settings)
+    return write_config(folder, config, {"error": {"test": {"exact": {"dssim": 0.1}}}})
 
 
 def edit(folder, **changes):
@@ -45,12 +46,14 @@ def test_round_trip(folder):
     loaded = Bundle.load(folder)
     assert loaded == written
     assert loaded.inputs == ("normal", "position")
-    assert loaded.position_scale == "1/radius"
+    assert loaded.channels == 6
+    assert loaded.dssim == 0.1
+    assert loaded.float32 == ("t1",)
     assert (loaded.input_name, loaded.output_name) == ("gbuffer", "shade")
     assert loaded.hashes["model.onnx"] == hashlib.sha256(b"graph").hexdigest()
     assert loaded.sha256 == hashlib.sha256(b"graph").hexdigest()
     assert loaded.short_hash == loaded.sha256[:12]
-    assert loaded.metrics == {"dssim": 0.1}
+    assert loaded.network == {"kind": "fold"}
     config = json.loads((folder / "config.json").read_text())
     assert config["hashes"] == loaded.hashes
     assert config["ranges"] == {"position": [-40.0, 40.0]}
@@ -73,35 +76,28 @@ def test_where_models_are(tmp_path, monkeypatch):
     assert str(bundle_root()) == "/elsewhere"
 
 
-def test_optional_files_are_verified_too(folder):
-    plain = make(folder)
-    assert plain.int8 is None
-    assert plain.probe is None
-    for name in ("model.int8.onnx", "probe.exr"):
-        (folder / name).write_bytes(name.encode())
+def test_a_run_for_each_colour_channel_sees_one_of_them(folder):
+    light = {"effect": "dof", "inputs": ["focal", "light"], "outputs": ["R", "G", "B"]}
+    assert make(folder, **light, per_channel=True).channels == 2
+    assert make(folder, **light).channels == 4
+
+
+@pytest.mark.parametrize(
+    "error", [{}, None, {"test": {}}, {"test-real": {"exact": {"dssim": "low"}}}]
+)
+def test_an_unknown_error_is_none(folder, error):
     make(folder)
-    loaded = Bundle.load(folder)
-    assert loaded.int8 == folder / "model.int8.onnx"
-    assert loaded.probe == folder / "probe.exr"
-    (folder / "probe.exr").write_bytes(b"other")
+    metrics = folder / "metrics.json"
+    metrics.write_text(json.dumps({"error": error}))
+    assert Bundle.load(folder).dssim is None
+
+
+def test_refuses_changed_and_missing_files(folder):
+    make(folder)
+    (folder / "model.onnx").write_bytes(b"other")
     with pytest.raises(BundleError, match="is not the file"):
         Bundle.load(folder)
-
-
-def test_background_reaches_as_far_as_the_halo_or_less(folder):
-    assert make(folder).background_halo == 96
-    assert "background_halo" not in json.loads((folder / "config.json").read_text())
-    assert make(folder, background_halo=8).background_halo == 8
-    assert Bundle.load(folder).background_halo == 8
-
-
-@pytest.mark.parametrize("name", ["model.onnx", "model.safetensors"])
-def test_refuses_changed_and_missing_files(folder, name):
-    make(folder)
-    (folder / name).write_bytes(b"other")
-    with pytest.raises(BundleError, match="is not the file"):
-        Bundle.load(folder)
-    (folder / name).unlink()
+    (folder / "model.onnx").unlink()
     with pytest.raises(BundleError, match="missing"):
         Bundle.load(folder)
 
@@ -129,10 +125,13 @@ def test_unknown_entries_name_the_nearest(folder):
         {"outputs": ["Y", "Y"]},
         {"halo": -1},
         {"halo": 1.5},
-        {"background_halo": -1},
+        {"bytes_per_pixel": 0},
+        {"per_channel": "yes"},
+        {"float32": "t1"},
+        {"float32": [1]},
+        {"network": []},
         {"size_multiple": 0},
         {"name": "../../etc"},
-        {"position_scale": "radius"},
         {"hashes": {}},
         {"hashes": {"../model.onnx": "0" * 64}},
         {"ranges": {"position": [1]}},

@@ -109,7 +109,7 @@ def test_circle_of_confusion_by_ray_tracing_a_lens():
         found = derivation.circle_of_confusion(np.array([[[depth]]], "f"), focus, aperture, ppu)
         assert found[0, 0, 0] == pytest.approx(expected, rel=1e-5, abs=1e-6)
     zero = derivation.circle_of_confusion(np.zeros((1, 1, 1), "f"), focus, aperture, ppu)
-    assert zero[0, 0, 0] == 0
+    assert zero[0, 0, 0] == pytest.approx(aperture / focus * ppu)  # infinitely far
 
 
 @pytest.mark.parametrize("angle", [0, 1e-4, 0.7, math.pi / 2, math.pi])

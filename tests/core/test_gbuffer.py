@@ -158,7 +158,11 @@ def test_derived_world_attributes():
     np.testing.assert_allclose(gbuffer.attributes["normal_world"], N_WORLD, atol=1e-5)
     toward = CAMERA.eye[:, None, None] - P_WORLD
     toward /= np.linalg.norm(toward, axis=0)
-    np.testing.assert_allclose(gbuffer.attributes["view"], toward * HIT, atol=1e-5)
+    np.testing.assert_allclose(gbuffer.attributes["view"] * HIT, toward * HIT, atol=1e-5)
+    # the sky too is seen from somewhere: against the camera's rays, turned to the world
+    rays = np.einsum("ji,jhw->ihw", CAMERA.matrix[:3, :3], -CAMERA.rays())
+    rays /= np.linalg.norm(rays, axis=0)
+    np.testing.assert_allclose(gbuffer.attributes["view"], rays, atol=1e-5)
     angle = np.arccos(np.clip((toward * N_WORLD).sum(0), -1, 1)) * HIT
     np.testing.assert_allclose(gbuffer.attributes["view_angle"][0], angle, atol=1e-3)
     assert set(gbuffer.attributes) == {"normal_world", "view", "view_angle", "depth"}
@@ -170,6 +174,26 @@ def test_focal_from_the_header():
     depth = Z[HIT].astype(np.float64)
     expected = 0.2 * (depth - 4) / (depth * 4) * (W / 2) / np.tan(np.radians(25))
     np.testing.assert_allclose(focal[HIT], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_background_keeps_what_says_something_of_it():
+    """The sky's light and the blur at infinity; not what NaN or a surface's attribute says."""
+    light = np.full((3, H, W), 70_000, np.float32)
+    light[:, ~HIT] = 0.25
+    light[1, 0, 0] = np.nan
+    assert not HIT[0, 0]
+    header = HEADER | {"deepshade:focus": 4.0, "deepshade:aperture": 0.2}
+    channels = {"Z": Z} | layer("light", light, "RGB") | layer("light_diffuse", light, "RGB")
+    gbuffer = load_gbuffer(encode(channels, header), ("light", "light_diffuse", "focal", "depth"))
+    found = gbuffer.attributes
+    sky = ~HIT
+    sky[0, 0] = False
+    assert (found["light"][:, sky] == 0.25).all()
+    assert (found["light"][:, 0, 0] == 0).all()
+    assert (found["light"][:, HIT] == 70_000).all()
+    assert not found["light_diffuse"][:, ~HIT].any()
+    at_infinity = 0.2 / 4 * (W / 2) / np.tan(np.radians(25))
+    np.testing.assert_allclose(found["focal"][0][~HIT], at_infinity, rtol=1e-4)
 
 
 def test_one_file_for_each_attribute(tmp_path):

@@ -18,7 +18,7 @@ def bumpy(size: int = 48) -> tuple[np.ndarray, np.ndarray]:
     return camera.position_from_depth(depth.astype(np.float32)), np.ones((size, size), bool)
 
 
-@pytest.mark.parametrize("turn", range(symmetry.COUNT))
+@pytest.mark.parametrize("turn", symmetry.ALL)
 def test_normals_from_turned_positions_are_turned_normals(turn: int) -> None:
     position, valid = bumpy()
     turned_normal = symmetry.apply(normals_from_positions(position, valid), "normal", turn)
@@ -28,7 +28,7 @@ def test_normals_from_turned_positions_are_turned_normals(turn: int) -> None:
     assert dots.min() > 0.999
 
 
-@pytest.mark.parametrize("turn", range(symmetry.COUNT))
+@pytest.mark.parametrize("turn", symmetry.ALL)
 def test_turned_positions_still_lie_on_their_pixels_rays(turn: int) -> None:
     position, _ = bumpy()
     turned = symmetry.apply(position, "position", turn)
@@ -59,6 +59,20 @@ def test_colours_and_world_vectors_only_move() -> None:
     for name in (None, "diffuse", "normal_world"):
         assert sorted(symmetry.apply(image, name, 5).ravel()) == sorted(image.ravel())
         assert (symmetry.apply(image, name, 4) == image.swapaxes(1, 2)).all()
+
+
+def test_rotations_are_the_turns_that_mirror_nothing() -> None:
+    """A triangle of pixels keeps its sense of going round."""
+    corners = np.zeros((1, 3, 3), np.float32)
+    corners[0, 0, 0], corners[0, 0, 2], corners[0, 2, 2] = 1, 2, 3
+    kept = []
+    for turn in symmetry.ALL:
+        image = symmetry.apply(corners, None, turn)[0]
+        (a, b, c) = (np.argwhere(image == k)[0] for k in (1, 2, 3))
+        across, down = b - a, c - b
+        if across[1] * down[0] - across[0] * down[1] > 0:
+            kept.append(turn)
+    assert tuple(kept) == symmetry.ROTATIONS
 
 
 def test_unknown_symmetries_are_refused() -> None:

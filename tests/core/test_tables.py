@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from deepshade.attributes import ATTRIBUTES
-from deepshade.effects import EFFECTS
+from deepshade.effects import EFFECTS, SETTINGS, Effect
 from deepshade.errors import ConfigError, LimitError, MissingAttributeError, nearest
 from deepshade.extras import EXTRAS, extra_of
 from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, detect, match_rank
@@ -37,15 +37,50 @@ def test_attributes_are_the_designs():
     assert {name: " ".join(a.channels) for name, a in ATTRIBUTES.items()} == CANONICAL
 
 
-def test_effects_use_known_attributes_and_outputs():
-    assert list(EFFECTS) == ["ao", "do", "ibl", "gi", "sss", "dof", "mb", "aa", "full"]
-    for effect in EFFECTS.values():
-        assert set(effect.inputs) <= set(ATTRIBUTES)
-        assert effect.outputs in (("Y",), ("R", "G", "B"))
-    assert EFFECTS["ao"].inputs == ("normal", "position")
-    assert EFFECTS["ao"].background == 1.0
-    assert ATTRIBUTES[EFFECTS["ao"].inputs[1]].channels[0] == "position.X"
-    assert [e.name for e in EFFECTS.values() if e.per_channel] == ["gi", "sss", "dof", "mb", "aa"]
+# the design's table of effects, written out a second time: inputs, background, trivial, settings
+DESIGN = {
+    "ao": ("N_s P_s", 1.0, 1.0, "radius"),
+    "do": ("N_w N_s P_s", 1.0, 1.0, "radius environment"),
+    "ibl": ("N_w C_w R_diff R_spec R_gloss", "shaded", "diffuse", "environment"),
+    "gi": ("N_s P_s L_diff", 0.0, 0.0, "radius"),
+    "sss": ("P_s R_scatt L", "light", "light", ""),
+    "dof": ("D_focal L", "shaded", "light", "focus aperture"),
+    "mb": ("F L D_s", "shaded", "light", "shutter"),
+    "aa": ("D_s L", "shaded", "light", ""),
+    "full": (
+        "N_w C_w R_diff R_spec R_gloss N_s P_s D_focal",
+        "shaded",
+        "diffuse",
+        "radius focus aperture environment",
+    ),
+}
+
+
+def test_effects_are_the_designs():
+    assert set(EFFECTS) == set(DESIGN)
+    for name, (inputs, background, trivial, settings) in DESIGN.items():
+        effect = EFFECTS[name]
+        assert effect.name == name
+        assert " ".join(ATTRIBUTES[i].symbol for i in effect.inputs) == inputs
+        assert (effect.background, effect.trivial) == (background, trivial)
+        assert " ".join(effect.settings) == settings
+        assert set(effect.settings) <= set(SETTINGS)
+        assert effect.is_light == (name != "ao")
+    per_channel = {name for name, effect in EFFECTS.items() if effect.per_channel}
+    assert per_channel == {"gi", "sss", "dof", "mb", "aa"}
+
+
+def test_what_is_measured_in_lengths_or_light_keeps_32_bits():
+    wide = {name for name, a in ATTRIBUTES.items() if a.unit.storage == "float32"}
+    assert {"position", "depth", "scatter", "light", "light_diffuse"} <= wide
+    assert {"normal", "diffuse", "view"}.isdisjoint(wide)
+    scaled = {name for name, a in ATTRIBUTES.items() if a.unit.scaled}
+    assert scaled == {"position", "depth", "scatter"}
+
+
+def test_an_effect_with_an_unknown_input_is_refused():
+    with pytest.raises(ValueError, match="no attribute is called 'nornal'"):
+        Effect("x", "X", ("nornal",), "")
 
 
 def test_extras_agree_with_the_project_file():

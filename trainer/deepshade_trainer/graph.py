@@ -49,7 +49,8 @@ def float32_boundary(model: Any) -> list[str]:
     """Names of the tensors at which the arithmetic before all convolutions ends.
 
     It is arithmetic on lengths, which 16 bits would round (`Bundle.float32`). What follows a
-    convolution may be calculated in 16 bits; shapes, which are integers, stay with their users.
+    convolution may be calculated in 16 bits; shapes, which are integers, stay with their users,
+    and so do channels taken out of the picture, which is no arithmetic.
     """
     import onnx
 
@@ -61,6 +62,7 @@ def float32_boundary(model: Any) -> list[str]:
     }
     makers = {name: node for node in graph.node for name in node.output}
     constant = {tensor.name for tensor in graph.initializer}
+    pictures = {value.name for value in graph.input}
     later: set[str] = set()
     for node in graph.node:  # ONNX keeps them in order
         sources = list(_sources(node))
@@ -78,10 +80,13 @@ def float32_boundary(model: Any) -> list[str]:
         if name in met or name in later or name in constant or name not in makers:
             continue
         met.add(name)
+        maker = makers[name]
+        if maker.op_type == "Slice" and maker.input[0] in pictures:
+            continue
         if name in floats:
             boundary[name] = None
         else:
-            todo += _sources(makers[name])
+            todo += _sources(maker)
     return list(boundary)
 
 
