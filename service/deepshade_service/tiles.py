@@ -80,19 +80,24 @@ class Grid:
 
 
 def plan_tiles(height: int, width: int, multiple: int, halo: int, max_pixels: int) -> Grid:
-    """The grid with the fewest computed pixels whose tiles have at most `max_pixels`.
+    """One tile if the padded picture has at most `max_pixels`, else the grid of such tiles that
+    computes the fewest pixels.
 
     `multiple` is the network's size multiple and `halo` its reach, both in pixels. Where even
     the smallest sensible tiles (`min_tile`) exceed `max_pixels`, it is a grid of those.
     """
     halo = up(halo, multiple)
-    tall, wide = (_costs(length, multiple, halo) for length in (height, width))
-    shapes = [(h, w) for w in wide for h in tall if h * w <= max_pixels]
-    shapes = shapes or [(min(tall), min(wide))]
-    best = min(shapes, key=lambda shape: tall[shape[0]] * wide[shape[1]])  # of equals the widest
-    return Grid(
-        _spans(height, best[0], multiple, halo), _spans(width, best[1], multiple, halo), best
+    best = padded(height, width, multiple)
+    if prod(best) > max_pixels:
+        tall, wide = (_costs(length, multiple, halo) for length in (height, width))
+        shapes = [(h, w) for w in wide for h in tall if h * w <= max_pixels]
+        shapes = shapes or [(min(tall), min(wide))]
+        best = min(shapes, key=lambda shape: tall[shape[0]] * wide[shape[1]])
+    rows, columns = (
+        _spans(length, side, multiple, halo)
+        for length, side in zip((height, width), best, strict=True)
     )
+    return Grid(rows, columns, best)
 
 
 def min_tile(height: int, width: int, multiple: int, halo: int) -> int:
