@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -13,6 +14,8 @@ from starlette.exceptions import HTTPException
 
 from deepshade.errors import DeepshadeError, EngineError, LimitError
 from deepshade.problems import MEDIA_TYPE, facts_of, kind_of, type_uri
+
+log = logging.getLogger("deepshade.service")
 
 # Which option of `deepshade serve` sets a limit: what its operator can do about it.
 _OPTIONS = {
@@ -84,7 +87,10 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(DeepshadeError)
     async def _(request: Request, error: DeepshadeError) -> JSONResponse:
-        return respond(from_error(error))
+        problem = from_error(error)
+        if problem.status >= 500:
+            log.error("%s: %s", request.url.path, error)
+        return respond(problem)
 
     @app.exception_handler(HTTPException)
     async def _(request: Request, error: HTTPException) -> JSONResponse:
