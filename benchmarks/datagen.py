@@ -17,12 +17,12 @@ import time
 from pathlib import Path
 
 from deepshade.machine import describe
-from deepshade_workers.datagen import Job, expand_scenes, generate, make_sample
+from deepshade_workers.datagen import DataSpec, expand_scenes, generate, make_sample
 
 WORKERS = 2
 
 
-def bare(job: Job, first: int) -> None:
+def bare(spec: DataSpec, first: int) -> None:
     """Render every second view in this process, on one thread, and keep nothing."""
     import drjit as dr
 
@@ -30,15 +30,15 @@ def bare(job: Job, first: int) -> None:
 
     mitsuba()
     dr.set_thread_count(1)
-    for index in range(first, job.views, WORKERS):
-        make_sample(job, index)
+    for index in range(first, spec.views, WORKERS):
+        make_sample(spec, index)
 
 
-def bare_seconds(job: Job) -> float:
+def bare_seconds(spec: DataSpec) -> float:
     """Seconds of two bare processes."""
     start = time.perf_counter()
     context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=bare, args=(job, k)) for k in range(WORKERS)]
+    processes = [context.Process(target=bare, args=(spec, k)) for k in range(WORKERS)]
     for process in processes:
         process.start()
     for process in processes:
@@ -48,11 +48,11 @@ def bare_seconds(job: Job) -> float:
     return time.perf_counter() - start
 
 
-def datagen_seconds(job: Job) -> float:
+def datagen_seconds(spec: DataSpec) -> float:
     """Seconds of the same views through Ray."""
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        for _ in generate(job, Path(folder)):
+        for _ in generate(spec, Path(folder)):
             pass
     return time.perf_counter() - start
 
@@ -66,15 +66,15 @@ def main() -> None:
     options = parser.parse_args()
     scenes = expand_scenes(["procedural"])
     shard = max(1, options.views // 10)
-    job = Job(scenes, options.views, frame=512, seed=11, shard_size=shard)
+    spec = DataSpec(scenes, options.views, frame=512, seed=11, shard_size=shard)
     times: dict[str, list[float]] = {"bare": [], "datagen": []}
     for _ in range(options.rounds):
-        times["bare"].append(bare_seconds(job))
-        times["datagen"].append(datagen_seconds(job))
-    rates = {name: job.views / statistics.median(found) for name, found in times.items()}
+        times["bare"].append(bare_seconds(spec))
+        times["datagen"].append(datagen_seconds(spec))
+    rates = {name: spec.views / statistics.median(found) for name, found in times.items()}
     result = {
         "machine": describe(),
-        "views": job.views,
+        "views": spec.views,
         "seconds": times,
         "views_per_second": rates,
         "ratio": rates["datagen"] / rates["bare"],
@@ -83,7 +83,8 @@ def main() -> None:
         print(json.dumps(result))
         return
     print(
-        f"{describe()}: {job.views} views of 256 x 256 at 256 rays a pixel, {options.rounds} rounds"
+        f"{describe()}: {options.views} views of 256 x 256 at 256 rays a pixel, "
+        f"{options.rounds} rounds"
     )
     for name, rate in rates.items():
         print(f"  {name:8} {rate:.2f} views a second")

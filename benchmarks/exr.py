@@ -136,7 +136,7 @@ def load_names(body: bytes) -> list[str]:
 
 
 def measure_writing(rounds: int) -> dict[str, Any]:
-    """Milliseconds to write one float32 plane as half, ZIP: ours, plainly, and the sizes."""
+    """Milliseconds to write one float32 plane as half: our ZIP, plainly, HTJ2K; and the sizes."""
     body = analytic_picture(512, 768)
     normal = exr.read(body).pixels["normal.Z"]
     # as smooth as an effect's answer, and nowhere 0
@@ -156,7 +156,13 @@ def measure_writing(rounds: int) -> dict[str, Any]:
         exr.write(stream, {"Y": shade}, half=True)
         sizes["ours"] = len(stream.getvalue())
 
-    return compare({"ours": ours, "plainly": plainly}, rounds) | {"bytes": sizes}
+    def htj2k() -> None:
+        stream = io.BytesIO()
+        exr.write(stream, {"Y": shade}, half=True, compression="htj2k256")
+        sizes["htj2k256"] = len(stream.getvalue())
+
+    ways = {"ours": ours, "plainly": plainly, "htj2k256": htj2k}
+    return compare(ways, rounds) | {"bytes": sizes}
 
 
 def compare(ways: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Any]:
@@ -188,8 +194,9 @@ def show(result: dict[str, Any]) -> None:
             for way in ("ours", "plainly", "library")
         )
         print(f"  {name:34}{cells}   {row['ratio']:5.2f}")
-    sizes = result["writing"]["bytes"]
-    print(f"written: {sizes['ours']:,} bytes, plainly {sizes['plainly']:,}")
+    writing = result["writing"]
+    for way, size in writing["bytes"].items():
+        print(f"  written {way:10}{writing['milliseconds'][way]['median']:9.1f} ms {size:9,} bytes")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Python library and command line that talk to a deepshade service."""
 
-from deepshade_client.answer import Answer
+from deepshade_client.answer import Answer, Saved
 from deepshade_client.client import AsyncClient, Client
 from deepshade_client.exceptions import (
     BadAnswer,
@@ -17,7 +17,7 @@ from deepshade_client.exceptions import (
     TooLarge,
     TransportError,
 )
-from deepshade_client.mock import MockTransport
+from deepshade_client.mock import MockTransport, mock_answer
 from deepshade_client.request import Options
 from deepshade_client.settings import NO_RETRY, Retry, Timeout
 
@@ -37,10 +37,12 @@ __all__ = [
     "NotReady",
     "Options",
     "Retry",
+    "Saved",
     "ServerFailed",
     "ServerProblem",
     "TimedOut",
     "Timeout",
     "TooLarge",
     "TransportError",
+    "mock_answer",
 ]

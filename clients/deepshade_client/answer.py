@@ -1,4 +1,4 @@
-"""What the service sends back."""
+"""Shaded pictures as the service sends them, in memory or saved."""
 
 from __future__ import annotations
 
@@ -64,6 +64,19 @@ class Answer:
             return exr.read(self.content).pixels
         except ImageError as error:
             raise BadAnswer(f"the answer ({self.media_type}) can't be decoded: {error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Saved:
+    """A shaded picture that went to disk as it arrived: where it is, and what is known of it.
+
+    `media_type`, `facts` and `timing` are as in `Answer`.
+    """
+
+    path: Path
+    media_type: str
+    facts: Mapping[str, str]
+    timing: Mapping[str, float]
 
 
 def facts(headers: Mapping[str, str]) -> dict[str, str]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from deepshade_client.answer import Answer
+from deepshade_client.answer import Saved
 from deepshade_client.client import AsyncClient
 from deepshade_client.exceptions import ClientError, ConnectionFailed
 from deepshade_client.request import Options
@@ -34,11 +34,14 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What came of a task: an answer or an error, and the seconds it took with all retries."""
+    """What came of a task: facts or an error, and the seconds it took with all retries.
+
+    Neither the picture's bytes nor the answer's are in it: a batch may be long.
+    """
 
     task: Task
     seconds: float
-    answer: Answer | None = None
+    saved: Saved | None = None
     error: Exception | None = None
 
 
@@ -49,7 +52,7 @@ def views(inputs: Sequence[str], *, together: bool = False) -> list[tuple[Path, 
 
 
 def together_or_one(sources: tuple[Path, ...]) -> Path | tuple[Path, ...]:
-    """What the client takes as a picture: several files of a view, or its only one."""
+    """A view as the client's picture argument: its only file, or the tuple of all."""
     return sources if len(sources) > 1 else sources[0]
 
 
@@ -108,15 +111,17 @@ async def run(
             if unreachable:
                 return
             start = time.perf_counter()
-            answer: Answer | None = None
+            saved: Saved | None = None
             failure: Exception | None = None
             try:
-                answer = await client.shade(effect, together_or_one(task.sources), options)
-                await asyncio.to_thread(_save, answer, task.target)
+                picture = together_or_one(task.sources)
+                saved = await client.shade_to(task.target, effect, picture, options)
             except (ClientError, OSError) as error:
-                failure = error
+                # its traceback and its cause hold the request, with the picture in it
+                failure = error.with_traceback(None)
+                failure.__cause__ = failure.__context__ = None
                 unreachable |= isinstance(error, ConnectionFailed)
-            result = Result(task, time.perf_counter() - start, answer, failure)
+            result = Result(task, time.perf_counter() - start, saved, failure)
             results.append(result)
             done(result)
 
@@ -124,11 +129,6 @@ async def run(
         for _ in range(min(jobs, len(tasks))):
             group.create_task(work())
     return results
-
-
-def _save(answer: Answer, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    answer.save(target)
 
 
 def _find(inputs: Sequence[str], out: Path | None) -> dict[Path, Path]:

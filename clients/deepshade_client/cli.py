@@ -91,7 +91,9 @@ def shade(
         bool, typer.Option("--explain", help="Print the plan as JSON; shade and save nothing.")
     ] = False,
     png: Annotated[bool, typer.Option("--png", help="8-bit PNG instead of EXR.")] = False,
-    compression: Annotated[str | None, typer.Option(help="Of the EXR, as zip or piz.")] = None,
+    compression: Annotated[
+        str | None, typer.Option(help="Of the EXR, as zip, piz or htj2k256.")
+    ] = None,
     full: Annotated[bool, typer.Option("--float", help="32-bit pixels instead of 16.")] = False,
     together: Annotated[
         bool, typer.Option("--together", help="All inputs are one view, one file per attribute.")

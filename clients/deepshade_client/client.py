@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AbstractContextManager, asynccontextmanager
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import httpx
 
-from deepshade_client.answer import Answer
+from deepshade.files import replacing
+from deepshade_client.answer import Answer, Saved
 from deepshade_client.exceptions import ClientError
 from deepshade_client.request import (
     Options,
@@ -21,6 +24,7 @@ from deepshade_client.request import (
     read_answer,
     read_effects,
     read_object,
+    read_saved,
     shade_request,
     transport_error,
 )
@@ -58,6 +62,16 @@ class Client:
         Also raises OSError for a file that can't be read.
         """
         return self._ask(shade_request(effect, picture, options or Options()), read_answer)
+
+    def shade_to(
+        self, path: Path | str, effect: str, picture: Picture, options: Options | None = None
+    ) -> Saved:
+        """Like `shade`, but the answer goes to a file as it arrives, and memory holds none of it.
+
+        Missing folders are made; a file there is replaced only when all is written.
+        """
+        request = shade_request(effect, picture, options or Options())
+        return self._try(lambda: self._save(Path(path), request))
 
     def explain(
         self, effect: str, picture: Picture, options: Options | None = None
@@ -97,12 +111,37 @@ class Client:
         self.close()
 
     def _ask(self, request: dict[str, Any], read: Callable[[httpx.Response], T]) -> T:
+        def ask() -> T:
+            response = self._http.request(**request)
+            try:
+                return read(response)
+            finally:
+                _release(response)
+
+        return self._try(ask)
+
+    def _save(self, path: Path, request: dict[str, Any]) -> Saved:
+        response = self._http.send(self._http.build_request(**request), stream=True)
+        try:
+            if not response.is_success:
+                response.read()
+            saved = read_saved(response, path)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as temporary, temporary.open("wb") as file:
+                for chunk in response.iter_bytes():
+                    file.write(chunk)
+            return saved
+        finally:
+            response.close()
+            _release(response)
+
+    def _try(self, ask: Callable[[], T]) -> T:
         attempt = 0
         while True:
             attempt += 1
             try:
                 try:
-                    return read(self._http.request(**request))
+                    return ask()
                 except httpx.HTTPError as error:
                     raise transport_error(error, self.server) from error
             except ClientError as error:
@@ -135,6 +174,13 @@ class AsyncClient:
         """Like `Client.shade`; files are read in a thread."""
         request = await asyncio.to_thread(shade_request, effect, picture, options or Options())
         return await self._ask(request, read_answer)
+
+    async def shade_to(
+        self, path: Path | str, effect: str, picture: Picture, options: Options | None = None
+    ) -> Saved:
+        """Like `Client.shade_to`; files are read and written in threads."""
+        request = await asyncio.to_thread(shade_request, effect, picture, options or Options())
+        return await self._try(lambda: self._save(Path(path), request))
 
     async def explain(
         self, effect: str, picture: Picture, options: Options | None = None
@@ -171,12 +217,38 @@ class AsyncClient:
         await self.close()
 
     async def _ask(self, request: dict[str, Any], read: Callable[[httpx.Response], T]) -> T:
+        async def ask() -> T:
+            response = await self._http.request(**request)
+            try:
+                return read(response)
+            finally:
+                _release(response)
+
+        return await self._try(ask)
+
+    async def _save(self, path: Path, request: dict[str, Any]) -> Saved:
+        response = await self._http.send(self._http.build_request(**request), stream=True)
+        try:
+            if not response.is_success:
+                await response.aread()
+            saved = read_saved(response, path)
+            await asyncio.to_thread(path.parent.mkdir, parents=True, exist_ok=True)
+            async with _in_threads(replacing(path)) as temporary:
+                with temporary.open("wb") as file:
+                    async for chunk in response.aiter_bytes():
+                        await asyncio.to_thread(file.write, chunk)
+            return saved
+        finally:
+            await response.aclose()
+            _release(response)
+
+    async def _try(self, ask: Callable[[], Awaitable[T]]) -> T:
         attempt = 0
         while True:
             attempt += 1
             try:
                 try:
-                    return read(await self._http.request(**request))
+                    return await ask()
                 except httpx.HTTPError as error:
                     raise transport_error(error, self.server) from error
             except ClientError as error:
@@ -184,3 +256,23 @@ class AsyncClient:
                 if pause is None:
                     raise
             await asyncio.sleep(pause)
+
+
+def _release(response: httpx.Response) -> None:
+    """Breaks httpx's cycle of a response and its stream.
+
+    Else the request's picture and the answer stay in memory until a garbage collection.
+    """
+    response.stream = httpx.ByteStream(b"")
+
+
+@asynccontextmanager
+async def _in_threads(manager: AbstractContextManager[T]) -> AsyncIterator[T]:
+    """A context whose beginning and good end wait for the disk; a bad end only cleans up."""
+    value = await asyncio.to_thread(manager.__enter__)
+    try:
+        yield value
+    except BaseException as error:
+        manager.__exit__(type(error), error, error.__traceback__)
+        raise
+    await asyncio.to_thread(manager.__exit__, None, None, None)

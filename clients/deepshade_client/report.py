@@ -78,8 +78,8 @@ def _cell(value: object) -> str:
 
 
 def _line(result: Result) -> str:
-    assert result.answer is not None
-    facts, timing = result.answer.facts, result.answer.timing
+    assert result.saved is not None
+    facts, timing = result.saved.facts, result.saved.timing
     parts = [f"[green]✓[/green] {escape(str(result.task.target))}  {result.seconds:.2f} s"]
     if timing:
         parts.append(" ".join(f"{name} {ms:.0f}" for name, ms in timing.items()) + " ms")
@@ -108,8 +108,8 @@ def _entry(task: Task, result: Result | None) -> dict[str, Any]:
     if result is None:
         return entry | {"error": {"detail": "not tried: the service can't be reached"}}
     entry["seconds"] = round(result.seconds, 4)
-    if result.answer is not None and result.error is None:
-        facts = {"facts": dict(result.answer.facts), "milliseconds": dict(result.answer.timing)}
+    if saved := result.saved:
+        facts = {"facts": dict(saved.facts), "milliseconds": dict(saved.timing)}
         return entry | {"ok": True} | facts
     error = result.error
     document = error.document if isinstance(error, ServerProblem) else {"detail": str(error)}

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import httpx
 
-from deepshade_client.answer import Answer, facts, timing
+from deepshade_client.answer import Answer, Saved, facts, timing
 from deepshade_client.exceptions import (
     BadAnswer,
     ClientError,
@@ -102,16 +102,22 @@ def explain_request(effect: str, picture: Picture, options: Options) -> dict[str
 
 def read_answer(response: httpx.Response) -> Answer:
     """The picture of a response. Raises ServerProblem, BadAnswer."""
+    return Answer(response.content, *_described(response))
+
+
+def read_saved(response: httpx.Response, path: Path) -> Saved:
+    """The same for a picture whose bytes go to a file; those of a problem must have been read."""
+    return Saved(path, *_described(response))
+
+
+def _described(response: httpx.Response) -> tuple[str, dict[str, str], dict[str, float]]:
+    """(media type, facts, timing) of a response that holds a picture."""
     check(response)
     media_type = response.headers.get("content-type", "").partition(";")[0]
     if media_type not in (EXR, PNG):
         raise BadAnswer(f"the answer is '{media_type}', not a picture")
-    return Answer(
-        response.content,
-        media_type,
-        facts(response.headers),
-        timing(response.headers.get("server-timing", "")),
-    )
+    headers = response.headers
+    return media_type, facts(headers), timing(headers.get("server-timing", ""))
 
 
 def base_url(server: str) -> httpx.URL:

@@ -16,8 +16,8 @@ from deepshade_client.exceptions import (
     NotReady,
 )
 
-_WORTH_IT = (ConnectionFailed, ConnectionBroken, Busy, NotReady)
-_LONGEST_ASKED = 300.0  # seconds; the service asks for a minute at most, a proxy might for a day
+_WORTH_RETRYING = (ConnectionFailed, ConnectionBroken, Busy, NotReady)
+MAX_RETRY_AFTER = 300.0  # seconds; the service asks for a minute at most, a proxy may for a day
 
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 
@@ -61,11 +61,11 @@ class Retry:
 
     def pause(self, error: ClientError, attempt: int) -> float | None:
         """Seconds to wait after the `attempt`-th failure (from 1); None: don't try again."""
-        if attempt >= self.attempts or not isinstance(error, _WORTH_IT):
+        if attempt >= self.attempts or not isinstance(error, _WORTH_RETRYING):
             return None
         own = self.first * 2.0 ** (attempt - 1) * random.uniform(1.0, 1.25)
         asked = getattr(error, "retry_after", None) or 0.0
-        return max(min(self.longest, own), min(asked, _LONGEST_ASKED))
+        return max(min(self.longest, own), min(asked, MAX_RETRY_AFTER))
 
 
 NO_RETRY = Retry(attempts=1)

@@ -38,9 +38,11 @@ class Bundle:
     `bytes_per_pixel` is the memory that a prediction takes for each pixel, in float32.
 
     `float32` names the tensors up to which the graph must be calculated in float32: arithmetic on
-    lengths, which 16 bits would round. `network` is the trainer's configuration of the network,
-    whose weights the graph holds by their own names. `ranges` are the (lowest, highest) values
-    seen in training; `hashes` maps file names to sha256.
+    lengths, which 16 bits would round. `int8` maps the weights of convolutions that may be
+    calculated in 8 bits to the range of what they convolve, and `int8_kinds` are the kinds of CPU
+    (`machine.cpu_kind`) on which that was found to add little error. `network` is the trainer's
+    configuration of the network, whose weights the graph holds by their own names. `ranges` are
+    the (lowest, highest) values seen in training; `hashes` maps file names to sha256.
     """
 
     path: Path
@@ -55,6 +57,8 @@ class Bundle:
     bytes_per_pixel: int
     per_channel: bool = False
     float32: tuple[str, ...] = ()
+    int8: dict[str, tuple[float, float]] = field(default_factory=dict)
+    int8_kinds: tuple[str, ...] = ()
     network: dict[str, Any] = field(default_factory=dict)
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
     hashes: dict[str, str] = field(default_factory=dict)
@@ -182,9 +186,11 @@ def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any])
             )
     if MODEL not in values.get("hashes", {}):
         raise BundleError(f"{where}: 'hashes' has none for {MODEL}", fix="export it again")
-    for key in ("inputs", "outputs", "float32"):
+    for key in ("inputs", "outputs", "float32", "int8_kinds"):
         values[key] = tuple(values.get(key, ()))
-    values["ranges"] = {k: (float(v[0]), float(v[1])) for k, v in values.get("ranges", {}).items()}
+    for key in ("ranges", "int8"):
+        pairs = values.get(key, {})
+        values[key] = {name: (float(pair[0]), float(pair[1])) for name, pair in pairs.items()}
     values["radius"], values["fov"] = float(values["radius"]), float(values["fov"])
     return Bundle(path=path, metrics=metrics, **values)
 
@@ -258,6 +264,8 @@ _CHECKS: dict[str, tuple[Any, str]] = {
     "bytes_per_pixel": (lambda v: _whole(v, 1, 1 << 24), "a whole number above 0"),
     "per_channel": (lambda v: isinstance(v, bool), "true or false"),
     "float32": (_tensors, "a list of names of the graph's tensors"),
+    "int8": (_ranges, "pairs of numbers, lowest first"),
+    "int8_kinds": (_tensors, "a list of kinds of CPU"),
     "network": (lambda v: isinstance(v, dict), "an object"),
     "ranges": (_ranges, "pairs of numbers, lowest first"),
     "hashes": (_hashes, "file names with sha256 digests"),

@@ -13,6 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from deepshade.errors import CameraError
 
 Window = tuple[int, int, int, int]
+# attribute -> (shape, least value)
+_PLACING: dict[str, tuple[tuple[int, ...], float | None]] = {
+    "pixelAspectRatio": ((), float(np.finfo(np.float32).tiny)),
+    "screenWindowCenter": ((2,), None),
+    "screenWindowWidth": ((), 0.0),
+    "worldToCamera": ((4, 4), None),
+}
 _FALLBACK_UP = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
 
 
@@ -190,6 +197,21 @@ def matrix_from_header(attributes: Mapping[str, Any]) -> NDArray[np.float64] | N
     except (TypeError, ValueError):
         raise CameraError("the header's worldToCamera is no 4 x 4 matrix") from None
     return _checked_matrix(matrix)
+
+
+def placement_of(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """The attributes of an EXR header that place its pixels, if they are usable.
+
+    Out of pixelAspectRatio > 0, screenWindowCenter (2 numbers), screenWindowWidth >= 0 and
+    worldToCamera (4, 4), as they stand there; what isn't finite is left out.
+    """
+    found: dict[str, Any] = {}
+    for name, (shape, least) in _PLACING.items():
+        value = np.asarray(attributes.get(name))
+        usable = value.shape == shape and value.dtype.kind == "f" and np.isfinite(value).all()
+        if usable and (least is None or value >= least):
+            found[name] = attributes[name]
+    return found
 
 
 def rotation_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:

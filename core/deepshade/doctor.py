@@ -1,4 +1,4 @@
-"""`deepshade doctor`: is everything there, and if not, the line that puts it right."""
+"""`deepshade doctor`: checks of this machine, each with the line that puts it right."""
 
 from __future__ import annotations
 
@@ -14,19 +14,12 @@ from typing import Annotated
 import typer
 
 from deepshade.errors import BundleError
-from deepshade.extras import EXTRAS, installed, missing_packages
+from deepshade.extras import installed, missing_packages, packages
 from deepshade.llvm import FIX as LLVM_FIX
 from deepshade.llvm import find_libllvm, libllvm_version
 from deepshade.machine import cpu_count, cpu_quota, memory_bytes
 
 _GIB = 1024**3
-_CORE = (
-    ("numpy", "numpy"),
-    ("OpenEXR", "OpenEXR"),
-    ("isal", "isal"),
-    ("typer", "typer"),
-    ("rich", "rich"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,40 +54,26 @@ def run_checks(checks: Sequence[Callable[[], list[Check]]] | None = None) -> lis
 
 
 def check_python() -> list[Check]:
-    """Python itself."""
+    """Whether Python is new enough."""
     version = ".".join(map(str, sys.version_info[:3]))
     ok = sys.version_info >= (3, 11)
     return [Check("python", ok, True, version, "" if ok else "install Python 3.11 or newer")]
 
 
 def check_packages() -> list[Check]:
-    """The core's packages, which are required, and each extra's, which aren't."""
-    lacking = [package for module, package in _CORE if not installed(module)]
-    checks = [
-        Check(
-            "core packages",
-            not lacking,
-            True,
-            f"missing: {', '.join(lacking)}" if lacking else "all installed",
-            "pip install deepshade" if lacking else "",
-        )
-    ]
-    for extra in EXTRAS:
+    """Whether the core's packages are installed (required) and each extra's (not required)."""
+    checks = []
+    for extra in packages():
         lacking = missing_packages(extra)
-        checks.append(
-            Check(
-                f"extra '{extra}'",
-                not lacking,
-                False,
-                f"missing: {', '.join(lacking)}" if lacking else "all installed",
-                f"pip install 'deepshade[{extra}]'" if lacking else "",
-            )
-        )
+        name = f"extra '{extra}'" if extra else "core packages"
+        detail = f"missing: {', '.join(lacking)}" if lacking else "all installed"
+        fix = f"pip install 'deepshade[{extra}]'" if extra else "pip install deepshade"
+        checks.append(Check(name, not lacking, not extra, detail, fix if lacking else ""))
     return checks
 
 
 def check_llvm() -> list[Check]:
-    """libLLVM, which Mitsuba needs to render on the CPU; required once Mitsuba is installed."""
+    """Whether libLLVM is found, which Mitsuba renders with; required if Mitsuba is installed."""
     needed = installed("mitsuba")
     path = find_libllvm()
     if path is None:
@@ -109,7 +88,7 @@ def check_llvm() -> list[Check]:
 
 
 def check_shared_memory(path: Path = Path("/dev/shm")) -> list[Check]:
-    """/dev/shm, where Ray's workers exchange arrays."""
+    """How large /dev/shm is, where Ray's workers exchange arrays."""
     if not path.is_dir():
         return [Check("shared memory", True, False, "no /dev/shm on this system")]
     total = shutil.disk_usage(path).total
@@ -118,7 +97,7 @@ def check_shared_memory(path: Path = Path("/dev/shm")) -> list[Check]:
 
 
 def check_machine() -> list[Check]:
-    """CPUs and memory, as far as this process may use them."""
+    """How many CPUs and how much memory this process may use."""
     quota = cpu_quota()
     cpus = f"{cpu_count()} usable of {os.cpu_count()}" + (f", quota {quota:g}" if quota else "")
     memory = memory_bytes()
@@ -152,7 +131,7 @@ def check_engines() -> list[Check]:
 
 
 def check_bundles(root: Path | None = None) -> list[Check]:
-    """The shipped models: each must match its hashes."""
+    """Whether each shipped model matches its hashes."""
     from deepshade.bundles import Bundle, bundle_folders, bundle_root
 
     root = root or bundle_root()

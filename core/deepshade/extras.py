@@ -1,52 +1,39 @@
-"""The optional parts of deepshade: which packages each needs."""
+"""The optional parts of deepshade: which packages each needs, by the installed metadata."""
 
 from __future__ import annotations
 
 import importlib.util
+import re
+from functools import cache
+from importlib.metadata import requires
 
-# extra -> (name to import, name to install)
-EXTRAS: dict[str, tuple[tuple[str, str], ...]] = {
-    "client": (("httpx", "httpx"), ("websockets", "websockets")),
-    "service": (
-        ("fastapi", "fastapi"),
-        ("uvicorn", "uvicorn"),
-        ("httptools", "httptools"),
-        ("onnxruntime", "onnxruntime"),
-        ("openvino", "openvino"),
-        ("python_multipart", "python-multipart"),
-        ("prometheus_client", "prometheus-client"),
-        ("PIL", "pillow"),
-    ),
-    "workers": (
-        ("ray", "ray"),
-        ("mitsuba", "mitsuba"),
-        ("trimesh", "trimesh"),
-        ("scipy", "scipy"),
-        ("PIL", "pillow"),
-        ("safetensors", "safetensors"),
-    ),
-    "trainer": (
-        ("torch", "torch"),
-        ("onnx", "onnx"),
-        ("onnxscript", "onnxscript"),
-        ("onnxruntime", "onnxruntime"),
-        ("openvino", "openvino"),
-        ("safetensors", "safetensors"),
-        ("tensorboard", "tensorboard"),
-        ("flip_evaluator", "flip-evaluator"),
-        ("PIL", "pillow"),
-    ),
-    "report": (
-        ("matplotlib", "matplotlib"),
-        ("jinja2", "jinja2"),
-        ("safetensors", "safetensors"),
-        ("mitsuba", "mitsuba"),
-        ("mitsuba_oidn", "mitsuba-oidn"),
-        ("torch", "torch"),
-    ),
-}
-# imported by a package above rather than by us
+# the first of these that brings a package is the one to install for it; the report borrows
+_ORDER = ("client", "service", "workers", "trainer", "report")
+# where a package isn't imported by its own name, with _ for -
+_MODULES = {"openexr": "OpenEXR", "pillow": "PIL"}
+# imported by a package of ours rather than by us
 _INDIRECT = {"drjit": "workers", "starlette": "service", "pydantic": "service"}
+
+
+@cache
+def packages() -> dict[str, tuple[str, ...]]:
+    """Extra -> the packages it needs, by their names for pip; "" are those of every installation.
+
+    From the distribution's requirements (its pyproject.toml), without versions.
+    """
+    found: dict[str, tuple[str, ...]] = dict.fromkeys(("", *_ORDER), ())
+    for requirement in requires("deepshade") or ():
+        specifier, _, marker = requirement.partition(";")
+        extra = re.search(r"extra == ['\"]([\w-]+)", marker)
+        name = extra[1] if extra else ""
+        if name in found and (package := re.match(r"[\w.-]+", specifier)):
+            found[name] += (package[0].lower(),)
+    return found
+
+
+def module_of(package: str) -> str:
+    """The name under which a package is imported."""
+    return _MODULES.get(package, package.replace("-", "_"))
 
 
 def installed(module: str) -> bool:
@@ -58,14 +45,14 @@ def installed(module: str) -> bool:
 
 
 def missing_packages(extra: str) -> list[str]:
-    """The packages of an extra that aren't installed, by their names for pip."""
-    return [package for module, package in EXTRAS[extra] if not installed(module)]
+    """The packages of an extra ("" for the core) that aren't installed, by their names for pip."""
+    return [package for package in packages()[extra] if not installed(module_of(package))]
 
 
 def extra_of(module: str) -> str | None:
     """The first extra that brings a module, or None if it is nobody's."""
     top = module.partition(".")[0]
-    for extra, packages in EXTRAS.items():
-        if any(top == name for name, _ in packages):
+    for extra in _ORDER:
+        if any(top == module_of(package) for package in packages()[extra]):
             return extra
     return _INDIRECT.get(top)

@@ -96,7 +96,7 @@ def cpu_flags() -> frozenset[str]:
 
 
 def cpu_kind() -> str:
-    """What the CPU multiplies 8 bits with: "amx", "vnni", or neither: its architecture.
+    """The CPU's instructions for 8-bit products: "amx", "vnni", or neither: its architecture.
 
     Libraries have kernels for each, so a precision's error on one kind says little of another.
     """

@@ -25,8 +25,9 @@ MAX_BYTES = 256 * 2**20
 class Shard:
     """One complete shard: file name in the folder, its sha256, and a record for each sample.
 
-    A record holds what renders the sample again: `scene`, `seed`, `radius`, `camera` (field of
-    view, frame, window origin, worldToCamera).
+    A record holds what renders the sample again: `scene`, `seed`, the settings that are set
+    (`radius`, `focus`, ...), `camera` (field of view, frame, window origin, worldToCamera), and
+    `displacements` where objects move.
     """
 
     file: str

@@ -1,9 +1,8 @@
-"""Image error: SSIM and DSSIM as the paper defines them, PSNR, MAE, and FLIP."""
+"""Image error: SSIM and DSSIM as the paper defines them, PSNR, MAE, SMAPE and FLIP."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,60 +14,6 @@ WINDOW = 8
 C1 = 1e-4
 C2 = 1e-3
 _STRIP = 16  # rows of windows at a time: what is being worked on stays in the CPU's cache
-
-
-@dataclass(slots=True)
-class _Moments:
-    """Means, and sums of squared or multiplied deviations from them, over n pixels each."""
-
-    n: int
-    x: Plane
-    y: Plane
-    xx: Plane
-    yy: Plane
-    xy: Plane
-
-    def cut(self, axis: int, start: int, length: int) -> _Moments:
-        index = (
-            (slice(None), slice(start, start + length)) if axis else slice(start, start + length)
-        )
-        return _Moments(
-            self.n,
-            *(p[index] for p in (self.x, self.y, self.xx, self.yy, self.xy)),
-        )
-
-    def joined(self, other: _Moments) -> _Moments:
-        """Both sets of pixels as one (Chan, Golub, LeVeque 1979): no large sums to cancel."""
-        n = self.n + other.n
-        dx, dy = other.x - self.x, other.y - self.y
-        share = other.n / n
-        weight = self.n * share
-        return _Moments(
-            n,
-            self.x + dx * share,
-            self.y + dy * share,
-            self.xx + other.xx + dx * dx * weight,
-            self.yy + other.yy + dy * dy * weight,
-            self.xy + other.xy + dx * dy * weight,
-        )
-
-    def windows(self, size: int, axis: int) -> _Moments:
-        """Every run of `size` pixels along an axis, built from runs of 1, 2, 4, … pixels."""
-        length = self.x.shape[axis] - size + 1
-        block, width = self, 1  # block: all runs of `width` pixels
-        result: _Moments | None = None
-        covered = 0
-        while True:
-            if size & width:
-                piece = block.cut(axis, covered, length)
-                result = piece if result is None else result.joined(piece)
-                covered += width
-            if covered == size:
-                assert result is not None
-                return result
-            room = block.x.shape[axis] - width
-            block = block.cut(axis, 0, room).joined(block.cut(axis, width, room))
-            width *= 2
 
 
 def ssim_map(
@@ -89,22 +34,48 @@ def ssim_map(
     height, width = x.shape[1] - rows + 1, x.shape[2] - min(window, x.shape[2]) + 1
     maps = np.empty((x.shape[0], height, width))
     for channel in range(x.shape[0]):
+        middle = y[channel].mean()
         for top in range(0, height, _STRIP):
             strip = slice(top, min(top + _STRIP, height) + rows - 1)
             maps[channel, top : top + _STRIP] = _ssim_strip(
-                x[channel, strip], y[channel, strip], window, c1, c2
+                x[channel, strip], y[channel, strip], middle, window, c1, c2
             )
     return maps[0] if np.ndim(image) == 2 else maps
 
 
-def _ssim_strip(x: Plane, y: Plane, window: int, c1: float, c2: float) -> Plane:
-    zero = np.zeros_like(x)
-    m = _Moments(1, x, y, zero, zero, zero)
-    for axis in (0, 1):
-        m = m.windows(min(window, x.shape[axis]), axis)
-    top = (2 * m.x * m.y + c1) * (2 / m.n * m.xy + c2)
-    bottom = (m.x * m.x + m.y * m.y + c1) * ((m.xx + m.yy) / m.n + c2)
+def _ssim_strip(x: Plane, y: Plane, middle: float, window: int, c1: float, c2: float) -> Plane:
+    """SSIM of every window of two (H, W) planes, by sums over boxes in float64.
+
+    `middle`, the reference's mean, is subtracted first, so that no variance is the small
+    difference of large numbers, however far from 0 the image lies.
+    """
+    u, v = x - middle, y - middle
+    rows, columns = min(window, x.shape[0]), min(window, x.shape[1])
+    mean_u, mean_v, square, product = (
+        _box_sums(_box_sums(plane, rows, 0), columns, 1) / (rows * columns)
+        for plane in (u, v, u * u + v * v, u * v)
+    )
+    covariance = product - mean_u * mean_v
+    variances = square - mean_u * mean_u - mean_v * mean_v  # of both together
+    mean_x, mean_y = mean_u + middle, mean_v + middle
+    top = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    bottom = (mean_x * mean_x + mean_y * mean_y + c1) * (variances + c2)
     return np.asarray(top / bottom)
+
+
+def _box_sums(plane: Plane, size: int, axis: int) -> Plane:
+    """Sums of every `size` neighbours along an axis, by halves: it becomes size - 1 shorter."""
+    if size == 1:
+        return plane
+
+    def part(plane: Plane, start: int) -> Plane:
+        end = start + length
+        return plane[start:end] if axis == 0 else plane[:, start:end]
+
+    length = plane.shape[axis] - size + 1
+    half = _box_sums(plane, size // 2, axis)
+    sums = part(half, 0) + part(half, size // 2)
+    return sums + part(plane, size - 1) if size % 2 else sums
 
 
 def ssim(
@@ -139,6 +110,34 @@ def psnr(image: ArrayLike, reference: ArrayLike, *, peak: float = 1.0) -> float:
     x, y = _pair(image, reference)
     error = float(np.square(x - y).mean())
     return math.inf if error == 0 else 10.0 * math.log10(peak * peak / error)
+
+
+def smape(image: ArrayLike, reference: ArrayLike, *, epsilon: float = 0.01) -> float:
+    """Symmetric mean absolute percentage error of two (H, W) or (C, H, W) images: in [0, 1].
+
+    The mean of |x - y| / (|x| + |y| + epsilon): relative, so that it needs no clipping and one
+    bright pixel doesn't outweigh the rest. For light; multiply both by `exposure(reference)` first,
+    so that epsilon, which keeps black against nearly black from counting, means the same
+    everywhere. Vogels et al., "Denoising with Kernel Prediction and Asymmetric Loss Functions",
+    2018, section 3. Raises ValueError for different shapes or non-finite values.
+    """
+    x, y = _pair(image, reference)
+    return float((np.abs(x - y) / (np.abs(x) + np.abs(y) + epsilon)).mean())
+
+
+def exposure(reference: ArrayLike) -> float:
+    """The factor that makes the 99th percentile of a picture's values 1.
+
+    (H, W) or (C, H, W) light, all channels together. Both pictures of a comparison are multiplied
+    by the reference's, then clipped to [0, 1] for `ssim` and `flip`. Where 99 % are black the
+    maximum counts instead, and of an all-black picture it is 1. Raises ValueError for non-finite
+    values.
+    """
+    values, _ = _pair(reference, reference)
+    for white in (float(np.percentile(values, 99)), float(values.max())):
+        if white > 1e-30:  # else the factor itself may overflow
+            return 1.0 / white
+    return 1.0
 
 
 def flip(image: ArrayLike, reference: ArrayLike, *, pixels_per_degree: float = 67.0) -> float:

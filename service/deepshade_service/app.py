@@ -17,6 +17,7 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade.engines import Engine
+from deepshade.errors import EngineError
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade_service import problems
@@ -66,11 +67,11 @@ class Service:
 
     async def shade(self, effect: str, request: Request, asked: ShadeParameters) -> Shaded:
         """Receive, queue and shade one picture."""
-        bundles, backend = allowed(self.models, effect, asked)
+        candidates = allowed(self.models, effect, asked)
         self.workers.check_place()  # before the body is received, to spare both sides the work
         async with self.uploads.receive(request) as files:
             with self.workers.place():
-                work = self.shader.shade(files, asked, bundles, backend)
+                work = self.shader.shade(files, asked, candidates)
                 shaded = await _unless_gone(request, work)
         if not asked.explain:
             nonfinite = int(shaded.facts["nonfinite_pixels"])
@@ -212,7 +213,9 @@ def _effect(name: str, models: Models) -> dict[str, Any]:
 
 
 def _bundle(bundle: Bundle, models: Models) -> dict[str, Any]:
-    backend = models.backend()
+    backend = None
+    with suppress(EngineError):  # pinned by the operator, and not for this bundle
+        backend = models.backend(bundle)
     return {
         "name": bundle.name,
         "sha256": bundle.sha256,
@@ -220,8 +223,8 @@ def _bundle(bundle: Bundle, models: Models) -> dict[str, Any]:
         "radius": bundle.radius,
         "size_multiple": bundle.size_multiple,
         "halo": bundle.halo,
-        "engine": backend.engine,
-        "precision": backend.precision,
+        "engine": backend and backend.engine,
+        "precision": backend and backend.precision,
         "dssim": bundle.dssim,
         "metrics": bundle.metrics,
     }

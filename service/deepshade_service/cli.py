@@ -72,10 +72,10 @@ def serve(
     from dataclasses import replace
 
     from deepshade.bundles import bundle_root
-    from deepshade.engines import choose
     from deepshade.errors import ConfigError
     from deepshade_service.config import Settings, default_limits
     from deepshade_service.memory import parse_size
+    from deepshade_service.models import check_backend
 
     models = models or bundle_root()
     if not models.is_dir():
@@ -83,7 +83,7 @@ def serve(
             "models", detail=f"there is no folder {models}; --models says where the bundles are"
         )
     if engine or precision:
-        choose(engine, precision)  # a wrong one is said now, and not by every answer
+        check_backend(engine, precision)  # said now, and not by every answer
     limits = {
         "body_bytes": parse_size(max_body) if max_body else None,
         "decoded_bytes": parse_size(max_decoded) if max_decoded else None,

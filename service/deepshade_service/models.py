@@ -35,7 +35,6 @@ class Models:
         self.refused: list[str] = []
         self._threads = threads
         self._pinned = engine, precision
-        self._default: Backend | None = None
         self._bundles: dict[str, dict[str, Bundle]] = {}
         self._engines: OrderedDict[Key, Engine] = OrderedDict()
         self._loading: dict[Key, asyncio.Task[Engine]] = {}
@@ -43,10 +42,8 @@ class Models:
 
     async def load(self) -> None:
         """Verify every bundle; what can't be used is left out, loudly. Loads no engine."""
-        try:
-            self._default = await asyncio.to_thread(choose, *self._pinned)
-        except EngineError as error:
-            log.error("the service stays unready: %s; %s", error, error.fix)
+        if not await asyncio.to_thread(available):
+            log.error("the service stays unready: no engine is installed")
             return
         found: dict[str, dict[str, Bundle]] = {}
         for folder in bundle_folders(self.root):
@@ -97,20 +94,12 @@ class Models:
             )
         return [bundle for bundle in bundles if name in (None, bundle.name)]
 
-    def backend(self, engine: str | None = None, precision: str | None = None) -> Backend:
-        """What a request with these pins runs on, by rule. Raises Problem 422 if it isn't here."""
-        if engine is None and precision is None and self._default is not None:
-            return self._default
-        try:
-            return choose(engine, precision)
-        except EngineError as error:
-            raise Problem(
-                422,
-                "no-backend",
-                str(error),
-                fix="choose one of `available`, or leave out ?engine= and ?precision=",
-                available=[str(one) for one in available()],
-            ) from None
+    def backend(
+        self, bundle: Bundle, engine: str | None = None, precision: str | None = None
+    ) -> Backend:
+        """What a request with these pins runs on, by rule. Raises EngineError if it isn't here."""
+        pins = (engine, precision) if engine or precision else self._pinned
+        return choose(bundle, *pins)
 
     async def engine(self, bundle: Bundle, backend: Backend) -> Engine:
         """The bundle's engine, warm. Who asks while it is loaded waits for that one.
@@ -166,6 +155,18 @@ class Models:
 def _error(bundle: Bundle) -> tuple[float, str]:
     """Known errors first; then by name."""
     return (float("inf") if bundle.dssim is None else bundle.dssim), bundle.name
+
+
+def check_backend(engine: str | None, precision: str | None) -> None:
+    """Raises EngineError when nothing on this machine is as asked."""
+    asked = [("engine", engine), ("precision", precision)]
+    for backend in available():
+        if all(value in (None, getattr(backend, name)) for name, value in asked):
+            return
+    raise EngineError(
+        f"no '{engine or '*'}/{precision or '*'}' on this machine",
+        fix=f"one of: {', '.join(map(str, available()))}",
+    )
 
 
 def find_effect(name: str) -> Effect:

@@ -89,7 +89,7 @@ class ShadeParameters(BaseModel):
         Field(description="What the network must run on, as `onnxruntime` or `openvino`."),
     ] = None
     precision: Annotated[
-        Literal["fp32", "bf16"] | None,
+        Literal["fp32", "bf16", "int8"] | None,
         Field(description="How exactly it must calculate."),
     ] = None
     explain: Annotated[

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
-from deepshade.engines import Backend
+from deepshade.engines import Backend, available
+from deepshade.errors import EngineError
 from deepshade_service.models import Models
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.problems import Problem
@@ -24,8 +25,12 @@ class Selection:
     reason: str
 
 
-def allowed(models: Models, effect: str, asked: ShadeParameters) -> tuple[list[Bundle], Backend]:
-    """(the bundles that a request may get, by error; what it runs on), whatever the picture.
+# A bundle, and what it runs on here.
+Candidate = tuple[Bundle, Backend]
+
+
+def allowed(models: Models, effect: str, asked: ShadeParameters) -> list[Candidate]:
+    """Those that a request may get, whatever the picture; the least error first.
 
     Raises Problem 404 (no such effect or bundle), 422 (no such backend here, contradicting
     parameters) and 503 (not ready).
@@ -40,74 +45,82 @@ def allowed(models: Models, effect: str, asked: ShadeParameters) -> tuple[list[B
         )
     bundles = models.find(effect, asked.quality or asked.bundle)
     asked.check(EFFECTS[effect])
-    return bundles, models.backend(asked.engine, asked.precision)
+    candidates: list[Candidate] = []
+    why = ""
+    for bundle in bundles:
+        try:
+            candidates.append((bundle, models.backend(bundle, asked.engine, asked.precision)))
+        except EngineError as error:
+            why = str(error)
+    if not candidates:
+        raise Problem(
+            422,
+            "no-backend",
+            why,
+            fix="choose one of `available`, or leave out ?engine= and ?precision=",
+            available=[str(one) for one in available()],
+        )
+    return candidates
 
 
 async def select(
     models: Models,
-    bundles: list[Bundle],
-    backend: Backend,
+    candidates: list[Candidate],
     asked: ShadeParameters,
     megapixels: dict[str, float],
 ) -> Selection:
-    """The one of `bundles` that a request gets, for a picture of which so much is computed.
+    """The one of `candidates` that a request gets, for a picture of which so much is computed.
 
     `megapixels` are by the bundle's name. Raises Problem 422 when an error or a time can't be
     kept, and 500 when a bundle that has to be timed can't be loaded.
     """
     if asked.budget_ms is not None:
-        return await _within_time(models, bundles, backend, asked, megapixels)
+        return await _within_time(models, candidates, asked.budget_ms, asked.max_error, megapixels)
     if asked.max_error is not None:
-        return _within_error(bundles, backend, asked.max_error)
-    pins = [
-        f"{n} {v}" for n in ("quality", "bundle", "engine", "precision") if (v := getattr(asked, n))
-    ]
-    default = [bundle for bundle in bundles if bundle.name == DEFAULT]
-    reason = f"asked for: {', '.join(pins)}" if pins else "the default"
-    return Selection((default or bundles)[0], backend, reason)
+        return _within_error(candidates, asked.max_error)
+    default = [candidate for candidate in candidates if candidate[0].name == DEFAULT]
+    names = ("quality", "bundle", "engine", "precision")
+    pins = ", ".join(f"{name} {value}" for name in names if (value := getattr(asked, name)))
+    reason = f"asked for: {pins}" if pins else "the default"
+    return Selection(*(default or candidates)[0], reason)
 
 
 async def _within_time(
     models: Models,
-    bundles: list[Bundle],
-    backend: Backend,
-    asked: ShadeParameters,
+    candidates: list[Candidate],
+    budget: float,
+    max_error: float | None,
     megapixels: dict[str, float],
 ) -> Selection:
     """The most accurate bundle whose network is predicted to keep the time."""
-    budget, most = asked.budget_ms, asked.max_error
-    assert budget is not None
-    times = {
-        bundle.name: await models.ms_per_megapixel(bundle, backend) * megapixels[bundle.name]
-        for bundle in bundles
-    }
-    fitting = [bundle for bundle in bundles if times[bundle.name] <= budget]
+    times = [
+        await models.ms_per_megapixel(*candidate) * megapixels[candidate[0].name]
+        for candidate in candidates
+    ]
+    fitting = [index for index, ms in enumerate(times) if ms <= budget]
     if not fitting:
-        quickest = min(times, key=lambda name: times[name])
-        best = times[quickest]
+        best, (quickest, backend) = min(zip(times, candidates, strict=True), key=lambda e: e[0])
         raise Problem(
             422,
             "budget-too-small",
-            f"no bundle shades this picture in {budget:g} ms: the quickest, {quickest} on"
-            f" {backend}, needs {best:.3g} ms for {megapixels[quickest]:.3g} megapixels,"
-            f" {best - budget:.3g} ms more",
+            f"no bundle shades this picture in {budget:g} ms: the quickest, {quickest.name} on"
+            f" {backend}, needs {best:.3g} ms, {best - budget:.3g} ms more",
             fix=f"ask for at least ?budget_ms={_up_to_three(best):g}, or send a smaller picture",
             asked=budget,
             best=best,
             short_by=best - budget,
-            bundle=quickest,
+            bundle=quickest.name,
         )
-    chosen = fitting[0]
-    if most is not None and (chosen.dssim is None or chosen.dssim > most):
-        raise _too_exact(most, chosen, f" within {budget:g} ms")
-    predicted = times[chosen.name]
-    reason = f"the most accurate within {budget:g} ms: {predicted:.3g} ms predicted"
-    return Selection(chosen, backend, reason)
+    bundle, backend = candidates[fitting[0]]
+    if max_error is not None and (bundle.dssim is None or bundle.dssim > max_error):
+        raise _too_exact(max_error, bundle, f" within {budget:g} ms")
+    predicted = f"{times[fitting[0]]:.3g} ms predicted"
+    return Selection(bundle, backend, f"the most accurate within {budget:g} ms: {predicted}")
 
 
-def _within_error(bundles: list[Bundle], backend: Backend, most: float) -> Selection:
+def _within_error(candidates: list[Candidate], most: float) -> Selection:
     """The bundle with the largest published error that is small enough: it is the fastest."""
-    known = [(bundle.dssim, bundle) for bundle in bundles if bundle.dssim is not None]
+    known = [(b.dssim, b, backend) for b, backend in candidates if b.dssim is not None]
     if not known:
         raise Problem(
             422,
@@ -118,9 +131,9 @@ def _within_error(bundles: list[Bundle], backend: Backend, most: float) -> Selec
     good = [entry for entry in known if entry[0] <= most]
     if not good:
         raise _too_exact(most, known[0][1])
-    error, chosen = good[-1]
+    error, bundle, backend = good[-1]
     reason = f"the fastest with an error of at most {most:g}: {error:.4g}"
-    return Selection(chosen, backend, reason)
+    return Selection(bundle, backend, reason)
 
 
 def _too_exact(most: float, best: Bundle, when: str = "") -> Problem:

@@ -7,7 +7,6 @@ import json
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from deepshade import exr, pictures, tensors
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS, SETTINGS
-from deepshade.engines import Backend, Engine
+from deepshade.engines import Engine
 from deepshade.gbuffer import GBuffer, load_gbuffer
 from deepshade.machine import trim
 from deepshade_service.memory import MemoryBudget, Need, need_of, size_of
@@ -23,7 +22,7 @@ from deepshade_service.models import Models
 from deepshade_service.parameters import LENS, ShadeParameters
 from deepshade_service.plan import Facts, Json, ShadePlan, explain, facts_of
 from deepshade_service.problems import Problem
-from deepshade_service.selection import Selection, select
+from deepshade_service.selection import Candidate, Selection, select
 from deepshade_service.telemetry import Stopwatch
 from deepshade_service.tiles import plan_tiles
 from deepshade_service.uploads import Upload
@@ -57,9 +56,9 @@ class Shader:
     limits: exr.Limits
 
     async def shade(
-        self, files: list[Upload], asked: ShadeParameters, bundles: list[Bundle], backend: Backend
+        self, files: list[Upload], asked: ShadeParameters, candidates: list[Candidate]
     ) -> Shaded:
-        """The answer, by one of the bundles. Waits, in turn, for a worker and for memory.
+        """The answer, by one of the candidates. Waits, in turn, for a worker and for memory.
 
         Raises what the steps raise, and Cancelled.
         """
@@ -88,28 +87,23 @@ class Shader:
             return Shaded(content, media_type, facts, shade[0].size, plan.computed, watch)
 
         headers = await self.workers.run(read)
-        selection = await self._select(headers, asked, bundles, backend)
+        selection = await self._select(headers, asked, candidates)
         bundle = selection.bundle
         need = need_of(headers, bundle, self.memory.total)
-        engine = None if asked.explain else await self.models.engine(bundle, backend)
+        engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
         async with self.memory.hold(need.total):
             return await self.workers.run(_tidy(work, need, engine))
 
     async def _select(
-        self,
-        headers: list[exr.Header],
-        asked: ShadeParameters,
-        bundles: list[Bundle],
-        backend: Backend,
+        self, headers: list[exr.Header], asked: ShadeParameters, candidates: list[Candidate]
     ) -> Selection:
         """Which bundle; a time is predicted as if there were no background."""
         megapixels: dict[str, float] = {}
-        if asked.budget_ms is not None:
-            for bundle in bundles:
-                most = need_of(headers, bundle, self.memory.total).max_pixels
-                grid = plan_tiles(*size_of(headers), bundle.size_multiple, bundle.halo, most)
-                megapixels[bundle.name] = grid.computed / 1e6
-        return await select(self.models, bundles, backend, asked, megapixels)
+        for bundle, _ in candidates if asked.budget_ms is not None else ():
+            most = need_of(headers, bundle, self.memory.total).max_pixels
+            grid = plan_tiles(*size_of(headers), bundle.size_multiple, bundle.halo, most)
+            megapixels[bundle.name] = grid.computed / 1e6
+        return await select(self.models, candidates, asked, megapixels)
 
 
 def read_headers(
@@ -207,18 +201,16 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
 def encode(
     shade: Float, gbuffer: GBuffer, asked: ShadeParameters, facts: Facts, made: Json
 ) -> tuple[bytes, str]:
-    """The answer's bytes and media type; it has the G-buffer's windows.
+    """The answer's bytes and media type; it lies where the G-buffer lay.
 
-    Its header holds `facts` and, as JSON, the plan (`made`). The frame starts at (0, 0), whatever
-    the display window's corner was.
+    Its header holds `facts` and, as JSON, the plan (`made`).
     """
     effect = EFFECTS[str(facts["effect"])]
     if asked.format == "png":
         return pictures.png(pictures.of_effect(shade, effect)), "image/png"
-    attributes: dict[str, Any] = gbuffer.camera.to_header() if gbuffer.camera else {}
+    attributes = gbuffer.placement()
     attributes |= {f"deepshade:{name}": value for name, value in facts.items()}
     attributes["deepshade:plan"] = json.dumps(made, separators=(",", ":"))
-    (x0, y0, *_), (left, top, right, bottom) = gbuffer.data_window, gbuffer.display_window
     stream = io.BytesIO()
     exr.write(
         stream,
@@ -226,8 +218,8 @@ def encode(
         attributes=attributes,
         compression=asked.compression,
         half=asked.half,
-        frame=(right - left + 1, bottom - top + 1),
-        origin=(x0 - left, y0 - top),
+        data_window=gbuffer.data_window,
+        display_window=gbuffer.display_window,
     )
     return stream.getvalue(), "image/x-exr"
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import tracemalloc
 
 import httpx
 import numpy as np
 import pytest
 
 import deepshade_client
+from deepshade import exr
 from deepshade_client import (
     NO_RETRY,
     AsyncClient,
@@ -29,6 +31,8 @@ from deepshade_client import (
     TimedOut,
     Timeout,
     TooLarge,
+    batch,
+    mock_answer,
 )
 
 FAST = Retry(attempts=4, first=0.001, longest=0.01)
@@ -51,7 +55,7 @@ def test_public_names():
     names = {
         "AsyncClient Client Answer Options MockTransport Retry NO_RETRY Timeout ClientError",
         "TransportError ConnectionBroken ConnectionFailed TimedOut ServerProblem BadRequest",
-        "MissingAttribute TooLarge Busy NotReady ServerFailed BadAnswer",
+        "MissingAttribute TooLarge Busy NotReady ServerFailed BadAnswer Saved mock_answer",
     }
     expected = {name for line in names for name in line.split()}
     assert set(deepshade_client.__all__) == expected
@@ -202,66 +206,130 @@ def test_async(server, make_exr):
 
 
 def test_mock_transport(make_exr):
-    mock = MockTransport(lambda gbuffer: 1 / -gbuffer.attributes["position"][2])
+    shade = np.linspace(0, 1, 24, dtype=np.float32).reshape(4, 6)
+
+    def handler(request):
+        if request.url.path == "/shade/ao":
+            return mock_answer({"Y": shade}, radius=2, radius_source="request")
+        return httpx.Response(422, json={"type": "urn:x:missing-attribute", "missing": ["depth"]})
+
+    mock = MockTransport(handler)
     with Client(transport=mock) as client:
-        answer = client.shade("ao", make_exr(4, 6), Options(radius=2))
-        several = client.shade("ao", [make_exr(4, 6)])
-        with pytest.raises(BadRequest):
-            client.shade("ao", b"hello")
-        with pytest.raises(BadRequest, match="no /"):
-            client.shade("aoo", b"")
-        assert client.effect("ao")["bundles"][0]["name"] == "mock"
-        assert client.effects()[0]["name"] == "ao"
-    assert answer.facts["radius"] == "2"
-    assert answer.channels()["Y"].shape == (4, 6)
-    assert (answer.channels()["Y"] > 0.1).all()
-    np.testing.assert_array_equal(several.channels()["Y"], answer.channels()["Y"])
-    assert mock.requests[0].url.path == "/shade/ao"
-    with Client(transport=mock) as client:
-        plan = client.explain("ao", make_exr(4, 6), Options(quality="fast", budget_ms=3))
-    assert (plan["bundle"], plan["pixels"]["all"]) == ("mock", 24)
-    query = mock.requests[-1].url.params
-    assert (query["quality"], query["budget_ms"], query["explain"]) == ("fast", "3.0", "true")
+        answer = client.shade("ao", make_exr(4, 6), Options(quality="fast", budget_ms=3))
+        with pytest.raises(MissingAttribute) as caught:
+            client.shade("dof", b"hello")
+    assert caught.value.missing == ["depth"]
+    assert answer.facts == {"radius": "2", "radius_source": "request"}
+    np.testing.assert_array_equal(answer.channels()["Y"], shade)
+    assert [request.url.path for request in mock.requests] == ["/shade/ao", "/shade/dof"]
+    assert dict(mock.requests[0].url.params) == {"quality": "fast", "budget_ms": "3.0"}
+    assert mock.requests[1].content == b"hello"
 
     async def work():
         async with AsyncClient(transport=mock) as client:
-            return await client.shade("ao", make_exr(4, 6), Options(radius=2))
+            return await client.shade("ao", make_exr(4, 6))
 
     assert asyncio.run(work()).content == answer.content
 
 
-def test_the_mock_answers_as_the_service_does(server, make_exr, make_picture):
-    """The same requests, to both: kinds of answers, statuses and kinds of problems."""
-    channels = make_picture(8, 8)
-    split = {
-        name: make_exr({k[-1]: v for k, v in channels.items() if name in k})
-        for name in ("normal", "position")
-    }
-    requests = [
-        (make_exr(8, 8), Options()),
-        (make_exr(8, 8), Options(format="png")),
-        (split, Options()),  # names of form fields say what the files hold
-        (b"hello", Options()),
-        (make_exr(8, 8)[:-20], Options()),
-        (make_exr({"A": channels["normal.X"]}), Options()),
-        (make_exr(8, 8), Options(radius=-1)),
-        (make_exr(8, 8), Options(fov=200)),
-        (make_exr(8, 8), Options(mapping={"nromal": "x"})),
-        (make_exr(8, 8), Options(mapping={"": "x"})),
-        (make_exr({"Z": 1 - channels["position.Z"]}), Options()),
-    ]
+def test_shade_to(server, make_exr, tmp_path):
+    target = tmp_path / "new" / "out.exr"
+    with Client(server, retry=NO_RETRY) as client:
+        answer = client.shade("ao", make_exr(8, 8), Options(radius=0.5))
+        saved = client.shade_to(target, "ao", make_exr(8, 8), Options(radius=0.5))
+        with pytest.raises(BadRequest, match="not an OpenEXR image"):
+            client.shade_to(target, "ao", b"hello")
+    assert (saved.path, saved.media_type, saved.facts) == (target, "image/x-exr", answer.facts)
+    assert list(saved.timing) == list(answer.timing)
+    np.testing.assert_array_equal(exr.read(target).pixels["Y"], answer.channels()["Y"])
+    assert [path.name for path in target.parent.iterdir()] == ["out.exr"]
 
-    def outcome(client, picture, options):
-        try:
-            answer = client.shade("ao", picture, options)
-        except BadRequest as error:
-            return error.status, error.kind
-        return answer.media_type, answer.facts["effect"]
+    async def work():
+        async with AsyncClient(server) as client:
+            return await client.shade_to(str(target), "ao", make_exr(8, 9))
 
-    mock = MockTransport(lambda gbuffer: 0.5 * gbuffer.attributes["normal"][2])
-    with Client(transport=mock) as one, Client(server, retry=NO_RETRY) as other:
-        for picture, options in requests:
-            assert outcome(one, picture, options) == outcome(other, picture, options), options
+    assert asyncio.run(work()).path == target
+    assert exr.read_header(target).parts[0].shape == (8, 9)
+
+
+class Pieces(httpx.SyncByteStream, httpx.AsyncByteStream):
+    """A body of 64 KiB pieces that are made when they are asked for; it may break at the end."""
+
+    def __init__(self, count, error=None):
+        self.count, self.error = count, error
+
+    def __iter__(self):
+        yield from (bytes(2**16) for _ in range(self.count))
+        if self.error:
+            raise self.error
+
+    async def __aiter__(self):
+        for piece in self:
+            yield piece
+
+
+def large(count, error=None):
+    headers = {"Content-Type": "image/x-exr"}
+    return httpx.Response(200, headers=headers, stream=Pieces(count, error))
+
+
+def test_an_answer_goes_to_disk_as_it_arrives(tmp_path):
+    """However large it is: 32 MiB here, of which memory never holds one."""
+
+    async def work():
+        async with AsyncClient(transport=MockTransport(lambda request: large(512))) as client:
+            return await client.shade_to(tmp_path / "a.exr", "ao", b"")
+
+    with Client(transport=MockTransport(lambda request: large(512))) as client:
+        for save in (
+            lambda: client.shade_to(tmp_path / "a.exr", "ao", b""),
+            lambda: asyncio.run(work()),
+        ):
+            tracemalloc.start()
+            save()
+            _, peak = tracemalloc.get_traced_memory()
+            tracemalloc.stop()
+            assert peak < 2**20 < (tmp_path / "a.exr").stat().st_size == 2**25
+
+
+def test_an_answer_that_breaks_off_leaves_nothing_and_is_asked_for_again(tmp_path):
+    answers = [large(3, httpx.ReadError("reset")), large(2)]
+    (tmp_path / "a.exr").write_bytes(b"before")
+
+    def handler(request):
+        assert (tmp_path / "a.exr").read_bytes() == b"before"
+        return answers.pop(0)
+
+    with Client(transport=MockTransport(handler), retry=FAST) as client:
+        client.shade_to(tmp_path / "a.exr", "ao", b"")
+    assert (tmp_path / "a.exr").stat().st_size == 2**17
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+@pytest.mark.parametrize("status", [200, 422, 0])
+def test_a_batch_keeps_no_bytes_of_what_is_done(status, tmp_path):
+    """Sixteen pictures of 1 MiB and their answers, of which one at a time is in memory."""
+    size, count = 2**20, 16
+    (tmp_path / "a.exr").write_bytes(bytes(size))
+    tasks = [batch.Task((tmp_path / "a.exr",), tmp_path / f"out/{n}.exr") for n in range(count)]
+
+    def handler(request):
+        if status == 0:
+            raise httpx.ReadError("reset", request=request)
+        return large(16) if status == 200 else failing(status)
+
+    async def work():
+        # what was sent isn't kept either, so no MockTransport
+        transport = httpx.MockTransport(handler)
+        async with AsyncClient(transport=transport, retry=NO_RETRY) as client:
+            return await batch.run(client, "ao", tasks, Options(), jobs=1, done=lambda result: None)
+
+    tracemalloc.start()
+    results = asyncio.run(work())
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert [result.error is None for result in results] == [status == 200] * count
+    assert peak < 4 * size
 
 
 @pytest.mark.parametrize("server", ["http://a:b", "127.0.0.1:8000", "ftp://x", "", "http://"])
@@ -381,8 +449,6 @@ def test_retry_after_as_a_date():
 
 
 def test_a_broken_connection_stops_no_batch(make_exr, tmp_path):
-    from deepshade_client import batch
-
     (tmp_path / "a.exr").write_bytes(make_exr(4, 4))
     tasks = [batch.Task((tmp_path / "a.exr",), tmp_path / f"{n}.exr") for n in range(3)]
     found = httpx.Response(200, content=b"x", headers={"Content-Type": "image/x-exr"})

@@ -91,8 +91,8 @@ def test_header_round_trip_through_a_file():
         body,
         {"Z": np.ones((10, 12), np.float32)},
         attributes=camera.to_header(),
-        frame=(64, 48),
-        origin=(-3, 40),
+        data_window=(-3, 40, 8, 49),
+        display_window=(0, 0, 63, 47),
     )
     part = exr.read_header(body.getvalue()).parts[0]
     back = Camera.from_header(part.attributes, part.data_window, part.display_window)

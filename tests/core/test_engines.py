@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import onnx
@@ -15,13 +16,21 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
 from deepshade.bundles import Bundle, write_config
-from deepshade.engines import Backend, EngineError, available, choose, load_engine, registry
+from deepshade.engines import (
+    Backend,
+    EngineError,
+    available,
+    choose,
+    load_engine,
+    openvino,
+    registry,
+)
 from deepshade.engines.openvino import MAX_SIZES
 from deepshade.machine import resident, trim
 
 # Of the values: rounding positions of 1000 in fp32, and the unit roundoff of bf16.
-TOLERANCE = {"fp32": 2**-12, "bf16": 2**-6}
-HERE = list(available())
+TOLERANCE = {"fp32": 2**-12, "bf16": 2**-6, "int8": 2**-5}
+HERE = [backend for backend in available() if backend.precision != "int8"]
 OPENVINO = Backend("openvino", "fp32")
 
 
@@ -63,7 +72,7 @@ def graph(convolutions: int = 1) -> onnx.ModelProto:
     return model
 
 
-def bundle(folder, model, *float32: str) -> Bundle:
+def bundle(folder, model, *float32: str, **more) -> Bundle:
     folder.mkdir()
     (folder / "model.onnx").write_bytes(model.SerializeToString())
     config = {
@@ -77,6 +86,7 @@ def bundle(folder, model, *float32: str) -> Bundle:
         "halo": 8,
         "bytes_per_pixel": 64,
         "float32": float32,
+        **more,
     }
     return write_config(folder, config, {})
 
@@ -226,9 +236,9 @@ def test_what_is_not_there_says_how_to_get_it(slopes):
             load_engine(slopes, Backend("cuda", "fp32"), threads=1)
 
 
-def test_the_rule_looks_at_the_machine_alone(monkeypatch):
-    """CUDA before OpenVINO before ONNX Runtime; 16 bits where the CPU calculates in them."""
-    able = {"cuda": ("fp32",), "openvino": ("bf16", "fp32"), "onnxruntime": ("fp32",)}
+def test_the_rule_looks_at_machine_and_bundle_alone(slopes, monkeypatch):
+    """CUDA before OpenVINO before ONNX Runtime; 16 bits, or 8 where that is proven, before 32."""
+    able = {"cuda": ("fp32",), "openvino": ("bf16", "int8", "fp32"), "onnxruntime": ("fp32",)}
 
     class Module:
         def precisions(self, engine):
@@ -238,16 +248,47 @@ def test_the_rule_looks_at_the_machine_alone(monkeypatch):
 
     monkeypatch.setattr(registry, "_module", lambda engine: Module())
     monkeypatch.setattr(registry, "available", registry.available.__wrapped__)
-    assert choose() == Backend("cuda", "fp32")
-    assert choose(precision="bf16") == Backend("openvino", "bf16")
+    monkeypatch.setattr(registry, "cpu_kind", lambda: "vnni")
+    proven = replace(slopes, int8={"kernel": (0.0, 1.0)}, int8_kinds=("vnni",))
+    assert choose(proven) == Backend("cuda", "fp32")
+    assert choose(proven, precision="bf16") == Backend("openvino", "bf16")
     able["cuda"] = ()
-    assert choose() == Backend("openvino", "bf16")
-    able["openvino"] = ("fp32",)
-    assert choose() == Backend("openvino", "fp32")
-    assert choose("onnxruntime") == Backend("onnxruntime", "fp32")
-    with pytest.raises(EngineError, match=r"no '\*/bf16'") as caught:
-        choose(precision="bf16")
+    assert choose(proven) == Backend("openvino", "bf16")
+    able["openvino"] = ("int8", "fp32")
+    assert choose(proven) == Backend("openvino", "int8")
+    assert choose(slopes) == Backend("openvino", "fp32")
+    monkeypatch.setattr(registry, "cpu_kind", lambda: "x86_64")
+    assert choose(proven) == Backend("openvino", "fp32")
+    assert choose(proven, precision="int8") == Backend("openvino", "int8")
+    assert choose(slopes, "onnxruntime") == Backend("onnxruntime", "fp32")
+    with pytest.raises(EngineError, match=r"no '\*/int8'") as caught:
+        choose(slopes, precision="int8")
     assert "openvino/fp32" in caught.value.fix
+
+
+@pytest.mark.skipif(Backend("openvino", "int8") not in available(), reason="no 8 bits here")
+def test_8_bits_cost_no_more_than_their_steps(tmp_path):
+    """The middle one of three convolutions in 8 bits: 256 steps over its input's range."""
+    model, gbuffer = graph(3), far_away()
+    names = [node.input[1] for node in model.graph.node if node.op_type == "Conv"]
+    model.graph.node[-2].input[1] = "inner"
+    kernel = next(t for t in model.graph.initializer if t.name == names[0])
+    model.graph.initializer.append(numpy_helper.from_array(numpy_helper.to_array(kernel), "inner"))
+    expected = reference(model, gbuffer)
+    span = float(np.abs(expected).max() * 4)
+    made = bundle(tmp_path / "b", model, "x0", int8={"inner": [-span, span]})
+    exact = load_engine(made, OPENVINO, threads=1).predict(gbuffer)
+    coarse = load_engine(made, Backend("openvino", "int8"), threads=1).predict(gbuffer)
+    assert 0 < np.abs(coarse - exact).max() < 2 * span / 255
+    wrong = bundle(tmp_path / "w", model, int8={"outer": [0, 1]})
+    with pytest.raises(EngineError, match="no convolution with the weights 'outer'"):
+        load_engine(wrong, Backend("openvino", "int8"), threads=1)
+
+
+def test_where_openvino_miscalculates_8_bits_it_does_not_offer_them(monkeypatch):
+    plain = openvino.precisions()
+    monkeypatch.setattr(openvino, "cpu_kind", lambda: "amx")
+    assert openvino.precisions() == tuple(name for name in plain if name != "int8")
 
 
 @pytest.mark.parametrize("backend", HERE, ids=str)

@@ -15,10 +15,11 @@ from deepshade.errors import DamagedImageError, ImageError, LimitError
 from deepshade.exr import Limits
 from deepshade.exr import chunks as exrchunks
 from deepshade.exr import decode as exrdecode
+from deepshade.exr import header as exrheader
 from deepshade.threads import thread_count
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "exr"
-LOSSLESS = ("none", "rle", "zips", "zip", "piz")
+LOSSLESS = ("none", "rle", "zips", "zip", "piz", "htj2k256")
 
 
 def plane(height=20, width=33, seed=0):
@@ -74,6 +75,21 @@ def test_round_trip(compression, half):
         assert image.header.parts[0].channels[name] == ("half" if is_half else "float")
 
 
+@pytest.mark.parametrize("version", [(3, 4, 13), (3, 3, 99)])
+@pytest.mark.parametrize("code", ["HTJ2K256", "HTJ2K32"])
+def test_htj2k_is_read_only_by_a_library_without_its_bugs(version, code, monkeypatch):
+    header = {"type": OpenEXR.scanlineimage, "compression": getattr(OpenEXR, f"{code}_COMPRESSION")}
+    body = by_openexr([OpenEXR.Part(header, {"Y": plane().astype(np.float16)}, "")])
+    assert exrheader.LIBRARY_VERSION >= (3, 5)
+    for enough in (exrheader.LIBRARY_VERSION, (3, 4, 14), (4, 0, 0)):
+        monkeypatch.setattr(exrheader, "LIBRARY_VERSION", enough)
+        np.testing.assert_array_equal(exr.read(body).pixels["Y"], plane().astype(np.float16))
+    monkeypatch.setattr(exrheader, "LIBRARY_VERSION", version)
+    with pytest.raises(ImageError, match=r"htj2k.* can't be read safely") as caught:
+        exr.read_header(body)
+    assert "3.4.14" in caught.value.fix
+
+
 @pytest.mark.parametrize("compression", ["pxr24", "b44", "b44a", "dwaa", "dwab"])
 def test_lossy_compressions_come_close(compression):
     smooth = np.add.outer(np.linspace(0, 1, 40), np.linspace(0, 1, 50)).astype(np.float32)
@@ -106,10 +122,13 @@ def test_uint_is_read_as_float():
 
 @pytest.mark.parametrize("origin", [(0, 0), (-7, 3), (500, -500)])
 def test_data_window_and_frame(origin):
-    body = encode({"Y": plane(5, 6)}, origin=origin, frame=(100, 50))
+    data, display = (*origin, origin[0] + 5, origin[1] + 4), (-9, 5, 90, 54)
+    body = encode({"Y": plane(5, 6)}, data_window=data, display_window=display)
     part = exr.read_header(body).parts[0]
-    assert part.data_window == (*origin, origin[0] + 5, origin[1] + 4)
-    assert part.display_window == (0, 0, 99, 49)
+    assert part.data_window == data
+    assert part.display_window == display
+    with OpenEXR.File(io.BytesIO(body)) as file:
+        assert tuple(np.ravel(file.header()["displayWindow"])) == display
     assert part.shape == (5, 6)
     np.testing.assert_array_equal(exr.read(body).pixels["Y"], plane(5, 6))
 
@@ -287,7 +306,6 @@ def patched(name, kind, value, **settings):
         ("dataWindow", "box2i", struct.pack("<4i", 5, 5, 4, 4), DamagedImageError),
         ("dataWindow", "box2i", struct.pack("<4i", 0, 0, 32, 10**6), DamagedImageError),
         ("displayWindow", "box2i", struct.pack("<4i", 0, 0, -1, -1), DamagedImageError),
-        # moved to the origin, as answers are, it would leave what an EXR can hold
         (
             "displayWindow",
             "box2i",
@@ -355,8 +373,8 @@ def test_damaged_pixels():
 @pytest.fixture
 def small_strips(monkeypatch):
     """As if images were too large to be decoded at once."""
-    monkeypatch.setattr(exrdecode, "_LEAST", 500)
-    monkeypatch.setattr(exrdecode, "_MOST", 1000)
+    monkeypatch.setattr(exrdecode, "MIN_STRIP", 500)
+    monkeypatch.setattr(exrdecode, "MAX_STRIP", 1000)
 
 
 def by_library(body):
@@ -371,7 +389,7 @@ def by_library(body):
 @pytest.mark.parametrize("compression", exr.COMPRESSIONS)
 def test_strips_give_what_the_whole_gives(compression, small_strips):
     planes = {"a": plane(300, 9), "layer.b": plane(300, 9, 1), "c": plane(300, 9, 2)}
-    body = encode(planes, compression=compression, half=["a", "c"], origin=(-4, -7))
+    body = encode(planes, compression=compression, half=["a", "c"], data_window=(-4, -7, 4, 292))
     image, (expected,) = exr.read(body), by_library(body)
     for name, values in expected.items():
         np.testing.assert_array_equal(image.pixels[name], values)
@@ -416,7 +434,7 @@ def test_parts_without_wanted_channels_are_not_decoded():
 
 
 def test_unwanted_channels_are_there_only_strip_by_strip(monkeypatch):
-    monkeypatch.setattr(exrdecode, "_MOST", 2**20)
+    monkeypatch.setattr(exrdecode, "MAX_STRIP", 2**20)
     size = 512 * 512 * 4
     body = encode({f"c{n:02}": plane(512, 512) for n in range(24)}, compression="none", half=True)
     for compressed in (body, encode(exr.read(body).pixels, compression="zip", half=True)):
@@ -475,13 +493,13 @@ def with_repeats(pattern, height, width=300, lines=16):
 def test_repeated_chunks_are_decoded_once(
     pattern, missing, compression, strip, decoded, monkeypatch
 ):
-    monkeypatch.setattr(exrdecode, "_WORTH_COMPARING", 0)
-    monkeypatch.setattr(exrdecode, "_LEAST", strip)
-    monkeypatch.setattr(exrdecode, "_MOST", strip)
+    monkeypatch.setattr(exrdecode, "MIN_STRIP", strip)
+    monkeypatch.setattr(exrdecode, "MAX_STRIP", strip)
     lines = {"zip": 16, "piz": 32, "zips": 1}[compression]
     missing = min(missing, lines - 1)  # scanlines of the last band: that one is like no other
     plane = with_repeats(pattern, len(pattern) * lines - missing, lines=lines)
-    body = encode({"Y": plane, "Z": -plane}, half=True, compression=compression, origin=(5, -9))
+    window = 5, -9, 4 + plane.shape[1], len(plane) - 10
+    body = encode({"Y": plane, "Z": -plane}, half=True, compression=compression, data_window=window)
     image = exr.read(body)
     np.testing.assert_array_equal(image.pixels["Y"], plane)
     np.testing.assert_array_equal(image.pixels["Z"], -plane)

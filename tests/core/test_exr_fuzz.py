@@ -6,10 +6,9 @@ import sys
 import pytest
 
 CHILD = r"""
-import faulthandler, io, random, sys, time
+import faulthandler, io, random, sys
 import numpy as np, OpenEXR
 from deepshade import exr
-from deepshade.exr import decode as exrdecode
 from deepshade.errors import DeepshadeError
 
 faulthandler.enable()
@@ -17,7 +16,6 @@ seed, count = map(int, sys.argv[1:])
 rng = np.random.default_rng(0)
 planes = {n: rng.random((37, 29)).astype("f") for n in ("Z", "normal.X", "normal.Y", "normal.Z")}
 planes["Z"][:34] = 1  # several chunks are alike
-exrdecode._WORTH_COMPARING = 0
 files = []
 for compression in exr.COMPRESSIONS:
     body = io.BytesIO()
@@ -62,7 +60,6 @@ for _ in range(count):
     else:
         for _ in range(random.randint(1, 40)):
             data[random.randrange(head // 2, len(data))] = random.randrange(256)
-    start = time.perf_counter()
     try:
         image = exr.read(bytes(data), limits=limits)
         good += 1
@@ -70,7 +67,6 @@ for _ in range(count):
     except DeepshadeError as error:
         bad += 1
         assert str(error)
-    assert time.perf_counter() - start < 5
 print(good, bad)
 """
 

@@ -57,9 +57,11 @@ def images(draw):
 def test_the_library_reads_what_we_write(image, compression, top, strip):
     planes, half = image
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(exrencode, "_LEAST", strip)
-        patch.setattr(exrencode, "_MOST", strip)
-        body = encode(planes, half=half, compression=compression, origin=(3, top))
+        patch.setattr(exrencode, "MIN_STRIP", strip)
+        patch.setattr(exrencode, "MAX_STRIP", strip)
+        height, width = next(iter(planes.values())).shape
+        window = 3, top, 2 + width, top + height - 1
+        body = encode(planes, half=half, compression=compression, data_window=window)
     found, ours = by_library(body), exr.read(body).pixels
     assert found.keys() == planes.keys() == ours.keys()
     for name, plane in planes.items():
@@ -94,7 +96,8 @@ ATTRIBUTES = {
 def test_headers_are_those_of_the_library(names):
     planes = {name: picture("smooth", 20, 9) for name in ("b", "B", "a.X", "ä")}
     attributes = {name: ATTRIBUTES[name] for name in names}
-    ours = encode(planes, attributes=attributes, origin=(-4, 7), frame=(50, 60))
+    windows = {"data_window": (-4, 7, 4, 26), "display_window": (0, 0, 49, 59)}
+    ours = encode(planes, attributes=attributes, **windows)
     arrays = {
         name: np.asarray(value, np.int32 if isinstance(value[0], int) else np.float32)
         for name, value in attributes.items()
@@ -136,9 +139,10 @@ def test_long_names(name):
         ({"attributes": {"pixelAspectRatio": 0.0}}, "pixel aspect of 0.0"),
         ({"attributes": {"pixelAspectRatio": float("nan")}}, "pixel aspect of nan"),
         ({"attributes": {"screenWindowWidth": -1.0}}, "screen window -1.0 wide"),
-        ({"origin": (2**30, 0)}, "data window"),
-        ({"frame": (0, 5)}, "display window"),
-        ({"frame": (5, 2**31)}, "display window"),
+        ({"data_window": (2**30, 0, 2**30 + 1, 1)}, "data window"),
+        ({"data_window": (0, 0, 2, 1)}, "2 x 2 pixels can't fill the data window"),
+        ({"display_window": (0, 0, -1, 4)}, "display window"),
+        ({"display_window": (0, 0, 4, 2**31)}, "display window"),
     ],
 )
 def test_refuses_what_no_file_can_hold(settings, words):
@@ -177,7 +181,7 @@ def test_all_kinds_of_numbers(dtype):
 
 
 def test_memory_is_the_output_and_some_strips(monkeypatch):
-    monkeypatch.setattr(exrencode, "_MOST", 2**17)
+    monkeypatch.setattr(exrencode, "MAX_STRIP", 2**17)
     plane = picture("smooth", 2048, 1024).astype(np.float64)
     tracemalloc.start()
     pieces = exrencode.encode({"Y": plane}, {"Y"}, *[(0, 0, 1023, 2047)] * 2, "zip", {})

@@ -9,7 +9,7 @@ import pytest
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS, SETTINGS, Effect
 from deepshade.errors import ConfigError, LimitError, MissingAttributeError, nearest
-from deepshade.extras import EXTRAS, extra_of
+from deepshade.extras import extra_of, installed, module_of, packages
 from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, detect, match_rank
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -85,14 +85,28 @@ def test_an_effect_with_an_unknown_input_is_refused():
 
 def test_extras_agree_with_the_project_file():
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    for extra, packages in EXTRAS.items():
-        wanted = {
-            re.split(r"[\[><=!~ ]", requirement)[0]
-            for requirement in declared["optional-dependencies"][extra]
-        }
-        assert {package for _, package in packages} == wanted
+    wanted = declared["optional-dependencies"] | {"": declared["dependencies"]}
+    del wanted["all"], wanted["dev"]
+    expected = {
+        extra: {re.split(r"[\[><=!~ ]", text)[0].lower() for text in requirements}
+        for extra, requirements in wanted.items()
+    }
+    found = {extra: set(names) for extra, names in packages().items()}
+    assert found == expected, "install again: the metadata is older than pyproject.toml"
+
+
+def test_packages_are_imported_by_the_names_we_think():
+    for package in {package for found in packages().values() for package in found}:
+        assert installed(module_of(package)), package  # all extras are installed where tests run
+
+
+def test_the_extra_of_a_module():
     assert extra_of("torch.nn") == "trainer"
+    assert extra_of("PIL") == "service"
+    assert extra_of("mitsuba") == extra_of("drjit") == "workers"
+    assert extra_of("matplotlib.pyplot") == "report"
     assert extra_of("numpy") is None
+    assert extra_of("pytest") is None
 
 
 def test_profiles_name_known_quantities_and_sign_every_component():

@@ -20,7 +20,7 @@ try:
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Mitsuba, Open Image Denoise or libLLVM
     pytest.skip(f"no ray tracing here: {error}", allow_module_level=True)
 
-from deepshade_workers.datagen import Job, make_shard
+from deepshade_workers.datagen import DataSpec, make_shard
 from deepshade_workers.scenes.mesh import Mesh, merge
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.shards import schema
@@ -33,7 +33,9 @@ SIZE = 96
 def view(tmp_path_factory: pytest.TempPathFactory) -> View:
     """A window of a view of a procedural scene, as it comes back from a data set's files."""
     folder: Path = tmp_path_factory.mktemp("rays")
-    job = Job(("procedural:stairs",), 1, size=SIZE, frame=128, spp=256, seed=3, min_contrast=0.12)
+    job = DataSpec(
+        ("procedural:stairs",), 1, size=SIZE, frame=128, spp=256, seed=3, min_contrast=0.12
+    )
     shard = make_shard(job, 0, folder, lambda: None)
     Manifest(job.settings(), schema(job.effects, SIZE)).with_shard(shard).write(folder)
     (found,) = load_views(folder)

@@ -224,7 +224,7 @@ class Local:
     def engine(self, name: str = "tiny") -> Engine:
         """The engine of that AO bundle, loaded if it isn't yet."""
         (bundle,) = self.service.models.find("ao", name)
-        return self.run(self.service.models.engine(bundle, self.service.models.backend()))
+        return self.run(self.service.models.engine(bundle, self.service.models.backend(bundle)))
 
     def wait(self, path: str = "/readyz") -> None:
         deadline = time.monotonic() + 30

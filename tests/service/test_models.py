@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from deepshade.bundles import Bundle
-from deepshade.engines import REFERENCE, available
+from deepshade.engines import REFERENCE, available, choose
 from deepshade_service import models as models_module
 from deepshade_service.models import Models
 from deepshade_service.parameters import ShadeParameters
@@ -157,7 +157,7 @@ def test_engines_in_memory_are_bounded(three, loads, monkeypatch):
     monkeypatch.setattr(models_module, "MAX_ENGINES", 2)
 
     async def use():
-        backend = three.backend()
+        backend = REFERENCE
         bundles = {bundle.name: bundle for bundle in three.find("ao")}
         speed = await three.ms_per_megapixel(bundles["fast"], backend)
         for name in ("best", "fast", "balanced", "fast", "best"):
@@ -186,15 +186,20 @@ def test_what_can_not_be_had(three, root):
 
 
 def test_backends_are_by_rule_unless_pinned(three, root):
-    assert three.backend() == REFERENCE  # as this service was started
+    def backend(models, **pins):
+        return allowed(models, "ao", ShadeParameters(**pins))[0][1]
+
+    assert backend(three) == REFERENCE  # as this service was started
     plain = Models(root, threads=1)
     asyncio.run(plain.load())
-    assert plain.backend() == available()[0]
-    for backend in available():
-        assert plain.backend(backend.engine, backend.precision) == backend
-    for pins in (("abacus", None), ("onnxruntime", "bf16")):
+    assert backend(plain) == choose(plain.find("ao")[0])
+    for one in available():
+        if one.precision != "int8":  # for which these bundles hold no ranges
+            assert backend(plain, engine=one.engine, precision=one.precision) == one
+            assert backend(three, engine=one.engine).engine == one.engine
+    for pins in ({"engine": "abacus"}, {"engine": "onnxruntime", "precision": "bf16"}):
         with pytest.raises(Problem) as caught:
-            plain.backend(*pins)
+            backend(plain, **pins)
         assert (caught.value.status, caught.value.kind) == (422, "no-backend")
         assert caught.value.more["available"] == [str(one) for one in available()]
 
@@ -202,9 +207,9 @@ def test_backends_are_by_rule_unless_pinned(three, root):
 def chosen(models, megapixels=1.0, **asked):
     """The bundle that a picture gets of which so much has to be computed."""
     parameters = ShadeParameters(**asked)
-    bundles, backend = allowed(models, "ao", parameters)
-    sizes = {bundle.name: megapixels for bundle in bundles}
-    return asyncio.run(select(models, bundles, backend, parameters, sizes)).bundle.name
+    candidates = allowed(models, "ao", parameters)
+    sizes = {bundle.name: megapixels for bundle, _ in candidates}
+    return asyncio.run(select(models, candidates, parameters, sizes)).bundle.name
 
 
 def test_a_name_chooses(three):
@@ -237,10 +242,9 @@ def test_an_error_chooses_what_is_just_good_enough(three, loads):
 
 
 def test_a_time_chooses_the_most_accurate_that_keeps_it(three):
-    backend = three.backend()
     speeds = {"fast": 10.0, "balanced": 100.0, "best": 1000.0}
     for bundle in three.find("ao"):
-        three._speeds[bundle.path, backend] = speeds[bundle.name]
+        three._speeds[bundle.path, REFERENCE] = speeds[bundle.name]
     assert chosen(three, megapixels=0.5, budget_ms=500) == "best"
     assert chosen(three, megapixels=0.5, budget_ms=499) == "balanced"
     assert chosen(three, megapixels=0.5, budget_ms=5) == "fast"

@@ -97,8 +97,8 @@ def test_png_of_occlusion_is_its_plain_value(client, make_exr):
 def test_the_answer_has_the_window_of_the_part_that_was_shaded(client, make_exr, make_picture):
     """A beauty pass, cropped to what it shows, comes first: in its own file, and as a part."""
     beauty = {name: np.ones((4, 6), np.float32) for name in "RGBA"}
-    other = make_exr(beauty, frame=(40, 30), origin=(20, 10))
-    body = make_exr(make_picture(16, 24), frame=(40, 30), origin=(3, 5))
+    other = make_exr(beauty, data_window=(20, 10, 25, 13), display_window=(0, 0, 39, 29))
+    body = make_exr(make_picture(16, 24), data_window=(3, 5, 26, 20), display_window=(0, 0, 39, 29))
     files = [("image", ("beauty.exr", other)), ("image", ("data.exr", body))]
     response = client.post("/shade/ao", files=files)
     assert response.status_code == 200, response.text
@@ -159,7 +159,13 @@ def test_position_is_derived_from_depth_and_the_field_of_view(client, make_exr, 
 
 
 def test_windows_and_camera_are_kept(client, make_exr):
-    body = make_exr(16, 24, frame=(100, 80), origin=(30, 20), attributes={"deepshade:fov": 40.0})
+    body = make_exr(
+        16,
+        24,
+        data_window=(30, 20, 53, 35),
+        display_window=(0, 0, 99, 79),
+        attributes={"deepshade:fov": 40.0},
+    )
     part = exr.read_header(shade(client, body).content).parts[0]
     assert part.data_window == (30, 20, 53, 35)
     assert part.display_window == (0, 0, 99, 79)

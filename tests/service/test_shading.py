@@ -213,7 +213,7 @@ def test_the_lens_that_is_asked_for_overrides_the_header(make_exr):
         "max_error=nan",
         "budget_ms=-1",
         "precision=fp8",
-        "precision=int8",
+        "precision=fp64",
         "focus=1",
         "aperture=0.5",
     ],

@@ -19,6 +19,17 @@ def quad(center: Any, u: Any, v: Any) -> Any:
     return Mesh.build(corners, np.array([[0, 1, 2], [0, 2, 3]]), crease=0)
 
 
+def seen(scene: Any, camera: Camera, *names: str, **settings: Any) -> Any:
+    """Attributes `names` of the camera's whole frame, 64 x 48 at most."""
+    from deepshade_workers.attributes import make_attributes
+    from deepshade_workers.trace import trace
+    from deepshade_workers.view import View
+
+    view = View(camera, radius=1.0, **settings)
+    hits = trace(scene, camera, min(camera.width, 64), min(camera.height, 48))
+    return make_attributes(scene, view, hits, names, seed=1)
+
+
 @pytest.fixture(scope="session")
 def down() -> Camera:
     """Looks straight down from height 2, 32² pixels."""

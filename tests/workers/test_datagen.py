@@ -22,22 +22,24 @@ from deepshade.camera import Camera
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import Manifest
-from deepshade_workers.datagen import Job, expand_scenes, generate, make_sample, make_shard
+from deepshade_workers.datagen import DataSpec, expand_scenes, generate, make_sample, make_shard
 from deepshade_workers.sample import render_sample
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.procedural import FAMILIES
+from deepshade_workers.shards import schema, write_shard
+from deepshade_workers.view import View
 
 SCENES = ("procedural:stairs", "procedural:level", "procedural:rubble")
-JOB = Job(scenes=SCENES, views=12, size=32, frame=64, spp=16, seed=5, shard_size=3)
+SPEC = DataSpec(scenes=SCENES, views=12, size=32, frame=64, spp=16, seed=5, shard_size=3)
 ROOT = Path(__file__).parents[2]
 DEEPSHADE = Path(sys.executable).with_name("deepshade")
 
 
-def command(out: Path, job: Job = JOB) -> list[str]:
-    """The command line of `job`."""
-    options = ["--out", str(out), *(x for s in job.scenes for x in ("--scenes", s))]
+def command(out: Path, spec: DataSpec = SPEC) -> list[str]:
+    """The command line of `spec`."""
+    options = ["--out", str(out), *(x for s in spec.scenes for x in ("--scenes", s))]
     for key in ("views", "size", "frame", "spp", "seed", "shard_size"):
-        options += [f"--{key.replace('_', '-')}", str(getattr(job, key))]
+        options += [f"--{key.replace('_', '-')}", str(getattr(spec, key))]
     return [*options, "--json"]
 
 
@@ -45,14 +47,14 @@ def command(out: Path, job: Job = JOB) -> list[str]:
 def expected(tmp_path_factory: Any) -> dict[str, str]:
     """Digests of the shards, made in this process without Ray."""
     folder = tmp_path_factory.mktemp("expected")
-    shards = [make_shard(JOB, k, folder, lambda: None) for k in range(JOB.shards)]
+    shards = [make_shard(SPEC, k, folder, lambda: None) for k in range(SPEC.shards)]
     return {shard.file: shard.sha256 for shard in shards}
 
 
 def check(folder: Path, expected: dict[str, str]) -> None:
     """`folder` holds the whole set, once, and nothing else."""
     manifest = Manifest.read(folder)
-    assert manifest.count == JOB.views
+    assert manifest.count == SPEC.views
     assert {shard.file: shard.sha256 for shard in manifest.shards} == expected
     for name, digest in expected.items():
         assert sha256(folder / name) == digest
@@ -60,8 +62,8 @@ def check(folder: Path, expected: dict[str, str]) -> None:
 
 
 def test_a_sample_can_be_rendered_again_from_its_record() -> None:
-    images, record = make_sample(JOB, 4)
-    again, same = make_sample(JOB, 4)
+    images, record = make_sample(SPEC, 4)
+    again, same = make_sample(SPEC, 4)
     assert record == same
     assert json.loads(json.dumps(record)) == record
     camera = record["camera"]
@@ -71,14 +73,13 @@ def test_a_sample_can_be_rendered_again_from_its_record() -> None:
         np.array(camera["world_to_camera"]),
         *camera["origin"],
     )
-    rendered, _ = render_sample(
+    rendered = render_sample(
         open_scene(record["scene"]),
-        view,
-        JOB.size,
-        JOB.size,
+        View(view, record["radius"]),
+        SPEC.size,
+        SPEC.size,
         effects=["ao"],
-        radius=record["radius"],
-        samples=JOB.spp,
+        samples=SPEC.spp,
         seed=record["seed"],
     )
     for name, image in images.items():
@@ -87,15 +88,29 @@ def test_a_sample_can_be_rendered_again_from_its_record() -> None:
 
 
 def test_a_shard_holds_what_the_manifest_says(tmp_path: Path) -> None:
-    shard = make_shard(JOB, 1, tmp_path, lambda: None)
+    shard = make_shard(SPEC, 1, tmp_path, lambda: None)
     tensors = load_file(tmp_path / shard.file)
     assert tensors["position"].dtype == np.float32
     assert tensors["normal"].dtype == np.float16
     assert tensors["reference_ao"].shape == (3, 1, 32, 32)
     assert len(shard.samples) == 3
     assert [record["scene"].split(":")[1] for record in shard.samples] == [
-        SCENES[k % 3].split(":")[1] for k in JOB.samples(1)
+        SCENES[k % 3].split(":")[1] for k in SPEC.samples(1)
     ]
+
+
+def test_shards_hold_light_and_lengths(tmp_path: Path) -> None:
+    """16 bits end at 65504 and resolve 1/2048: occlusion and directions fit, these don't."""
+    tensors = schema(["ao", "sss"], 8)
+    narrow = {name for name, entry in tensors.items() if entry["dtype"] == "float16"}
+    assert narrow == {"normal", "reference_ao", "reference_ao_error"}
+    bright = {
+        name: np.full(t["shape"], 1.0 + 7e4 * (name not in narrow)) for name, t in tensors.items()
+    }
+    write_shard(tmp_path, 0, tensors, [bright], [{}])
+    found = load_file(tmp_path / "shard-00000.safetensors")
+    for name in ("light", "scatter", "position", "reference_sss", "reference_sss_error"):
+        assert (found[name] == 70_001).all()
 
 
 def test_scene_names_expand(tmp_path: Path) -> None:
@@ -111,26 +126,34 @@ def test_scene_names_expand(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"views": 0}, {"seed": -1}, {"frame": 8}, {"scenes": ()}, {"shard_size": 0}, {"radius": -1.0}],
+    [
+        {"views": 0},
+        {"seed": -1},
+        {"frame": 8},
+        {"scenes": ()},
+        {"shard_size": 0},
+        {"radius": -1.0},
+        {"effects": ("ao", "nothing")},
+    ],
 )
 def test_impossible_jobs_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
-        Job(**{"scenes": SCENES, "views": 1, **change})
+        DataSpec(**{"scenes": SCENES, "views": 1, **change})
 
 
 def test_another_job_does_not_go_on(tmp_path: Path) -> None:
-    Manifest(JOB.settings(), {}).write(tmp_path)
-    other = Job(**{**JOB.settings(), "scenes": SCENES, "effects": ("ao",), "seed": 6})
+    Manifest(SPEC.settings(), {}).write(tmp_path)
+    other = DataSpec(**{**SPEC.settings(), "scenes": SCENES, "effects": ("ao",), "seed": 6})
     with pytest.raises(DataError, match="seed 5"):
         next(generate(other, tmp_path))
 
 
 def test_a_complete_set_needs_no_ray(tmp_path: Path, expected: dict[str, str]) -> None:
-    manifest = Manifest(JOB.settings(), {})
-    for k in range(JOB.shards):
-        manifest = manifest.with_shard(make_shard(JOB, k, tmp_path, lambda: None))
+    manifest = Manifest(SPEC.settings(), {})
+    for k in range(SPEC.shards):
+        manifest = manifest.with_shard(make_shard(SPEC, k, tmp_path, lambda: None))
     manifest.write(tmp_path)
-    assert list(generate(JOB, tmp_path)) == [(12, 12)]
+    assert list(generate(SPEC, tmp_path)) == [(12, 12)]
     check(tmp_path, expected)
 
 

@@ -39,6 +39,10 @@ def test_glb_keeps_transforms_and_materials(tmp_path: Path) -> None:
     assert mesh.materials[~right, 0].max() == pytest.approx(200 / 255, abs=0.01)
     assert mesh.materials[right, 0].max() == 0  # metal has no diffuse part
     assert mesh.materials[right, 3].min() == pytest.approx(1, abs=0.01)
+    assert {item.name: mesh.materials[item.start, 3] > 0.9 for item in mesh.objects} == {
+        "red": False,
+        "gold": True,
+    }
     assert mesh.materials[0, 6] == pytest.approx(2 / 0.25**2 - 2, rel=0.01)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Any
 
 import numpy as np
 import pytest
 
 from deepshade_workers.scenes.procedural import FAMILIES, generate, primitives
+from deepshade_workers.scenes.procedural.assembly import MEAN_FREE_PATHS
 from deepshade_workers.scenes.procedural.interiors import curtain, random_cushion, vase
 from deepshade_workers.scenes.procedural.nature import leaf
 
@@ -26,6 +28,49 @@ SOLIDS: dict[str, tuple[Any, float | None]] = {
     "vase": (lambda: vase(RNG(1)), None),
     "cushion": (random_cushion, None),
 }
+
+
+# Digests of vertices, faces, normals and all of the materials but their scattering, to 1e-6, as
+# they were before materials scattered.
+BEFORE = {
+    "level": "acb9c43a05ccb5c3",
+    "rubble": "74343cb6673cb650",
+    "foliage": "74f155cb8ff38115",
+    "cave": "23fef00434e0d6be",
+}
+
+
+@pytest.mark.parametrize("family", BEFORE)
+def test_scattering_changes_nothing_else_of_a_seed(family: str) -> None:
+    mesh = generate(family, 7)
+    digest = hashlib.sha256()
+    for values in (mesh.vertices, mesh.faces, mesh.normals, mesh.materials[:, :7]):
+        digest.update((np.round(values, 6) + 0.0).tobytes())
+    assert digest.hexdigest()[:16] == BEFORE[family]
+
+
+def test_some_materials_scatter() -> None:
+    colours = np.concatenate([np.unique(generate(f, 7).materials, axis=0) for f in FAMILIES])
+    scatter = colours[:, 7:]
+    share = (scatter > 0).all(1).mean()
+    assert 0.3 < share < 0.5
+    assert ((scatter == 0).all(1) | (scatter > 0).all(1)).all()
+    low, high = MEAN_FREE_PATHS
+    assert 0.2 * low <= scatter[scatter > 0].min() <= scatter.max() <= high
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_scenes_keep_their_objects(family: str) -> None:
+    mesh = generate(family, 7)
+    stops = [item.stop for item in mesh.objects]
+    assert [item.start for item in mesh.objects] == [0, *stops[:-1]]
+    assert stops[-1] == len(mesh.faces)
+    assert len({item.name for item in mesh.objects}) == len(mesh.objects) >= 2
+    # No face of one object has a vertex of another.
+    number = np.repeat(np.arange(len(stops)), [o.stop - o.start for o in mesh.objects])
+    owner = np.full(len(mesh.vertices), -1)
+    owner[mesh.faces] = number[:, None]
+    assert (owner[mesh.faces] == number[:, None]).all()
 
 
 def test_there_are_at_least_a_dozen_families() -> None:

@@ -13,7 +13,7 @@ from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.cli import main
 from deepshade.gbuffer import load_gbuffer
-from deepshade_workers.scenes.scene import SUN_DIRECTION, SUN_IRRADIANCE
+from deepshade_workers.scenes.scene import SKY_RADIANCE, SUN_DIRECTION, SUN_IRRADIANCE, Scene
 
 VIEW = ["--eye", "2", "3", "4", "--target", "0", "0.4", "0", "--size", "48x32"]
 SCENE = "procedural:crockery:1"
@@ -68,7 +68,6 @@ def test_the_sun_lights_what_faces_it(tmp_path: Path) -> None:
     """An open floor under the default lights: sun, sky and lamp, all known in closed form."""
     from deepshade.camera import Camera
     from deepshade_workers.lighting import LAMP, direct_light
-    from deepshade_workers.scenes.scene import SKY_RADIANCE, Scene
     from deepshade_workers.trace import trace
 
     from .conftest import quad
@@ -106,7 +105,7 @@ def test_json_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["--size", "0x5"], "--size"),
         (["--size", "big"], "--size"),
         (["--effects", "aoo"], "ao"),
-        (["--effects", "gi"], "no reference"),
+        (["--effects", "gi"], "no reference for 'gi'; there are: ao"),
         (["--radius", "-1"], "radius"),
         (["--radius", "nan"], "radius"),
         (["--fov", "180"], "field of view"),

@@ -9,11 +9,9 @@ from typing import Any
 from deepshade.errors import DeepshadeError
 from deepshade.llvm import FIX, find_libllvm
 
-VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
-
 
 @functools.cache
-def mitsuba(variant: str | None = None) -> Any:
+def mitsuba() -> Any:
     """Import Mitsuba and set its variant: `cuda_ad_rgb` where there is a GPU, else `llvm_ad_rgb`.
 
     Raises:
@@ -22,21 +20,15 @@ def mitsuba(variant: str | None = None) -> Any:
     library = find_libllvm()
     if library is not None:
         os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(library))
+    import drjit as dr
     import mitsuba as mi
 
-    if variant is None:
-        variant = "cuda_ad_rgb" if _has_gpu() else "llvm_ad_rgb"
-    if variant == "llvm_ad_rgb" and library is None:
+    gpu = dr.has_backend(dr.JitBackend.CUDA)
+    if library is None and not gpu:
         raise DeepshadeError(
             "Mitsuba's llvm_ad_rgb variant needs libLLVM 17 or newer, and none was found",
             fix=FIX,
         )
-    mi.set_variant(variant)
+    mi.set_variant("cuda_ad_rgb" if gpu else "llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     return mi
-
-
-def _has_gpu() -> bool:
-    import drjit as dr
-
-    return bool(dr.has_backend(dr.JitBackend.CUDA))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -48,26 +49,27 @@ def render(
 
     from deepshade.camera import Camera
     from deepshade.errors import ConfigError
+    from deepshade_workers.references import require
     from deepshade_workers.render import render as render_view
     from deepshade_workers.scenes.loading import open_scene
+    from deepshade_workers.view import View
 
     if radius is not None and not (math.isfinite(radius) and radius > 0):
         raise ConfigError("radius", detail=f"the radius must be above 0, not {radius}")
-    names = _known([name.strip() for name in effects.split(",") if name.strip()])
+    names = [name.strip() for name in effects.split(",") if name.strip()]
+    require(names)
+    chosen = _attributes(attributes)
     width, height = _size(size)
     camera = Camera.look_at(eye, target, up, fov, width, height)
     opened = open_scene(scene)
-    figures = render_view(
-        opened,
+    view = View(
         camera,
-        output,
-        effects=names,
         radius=opened.diagonal / 20 if radius is None else radius,
-        samples=spp,
-        seed=seed,
         focus=math.dist(eye, target) if focus is None else focus,
         aperture=aperture,
-        attributes=_attributes(attributes),
+    )
+    figures = render_view(
+        opened, view, output, effects=names, samples=spp, seed=seed, attributes=chosen
     )
     if as_json:
         typer.echo(json.dumps(figures))
@@ -138,12 +140,12 @@ def datagen(
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
-    from deepshade_workers.datagen import Job, expand_scenes, generate, rate
+    from deepshade_workers.datagen import DataSpec, expand_scenes, generate
 
-    job = Job(
+    spec = DataSpec(
         scenes=expand_scenes(scenes),
         views=views,
-        effects=tuple(_known(effects or ["ao"])),
+        effects=tuple(effects or ["ao"]),
         size=size,
         frame=frame or size,
         spp=spp,
@@ -152,82 +154,42 @@ def datagen(
         min_contrast=min_contrast,
         shard_size=shard_size,
     )
-    begun, start, done = time.monotonic(), None, 0
-    with _progress(hidden=as_json) as report:
-        for done, total in generate(job, out, address=address):
-            start = done if start is None else start
-            report(done, total)
-    fresh = done - (start or 0)
+    begun = time.monotonic()
+    done, fresh = _watched(generate(spec, out, address=address), hidden=as_json)
+    seconds = time.monotonic() - begun
     summary = {
         "out": str(out),
         "views": done,
         "rendered": fresh,
-        "seconds": round(time.monotonic() - begun, 2),
-        "views_per_second": round(rate(fresh, begun), 3),
+        "seconds": round(seconds, 2),
+        "views_per_second": round(fresh / max(seconds, 1e-9), 3),
     }
     typer.echo(json.dumps(summary) if as_json else f"{done} views in {out}, {fresh} of them new")
 
 
-def _known(effects: list[str]) -> list[str]:
-    from deepshade.errors import ConfigError
-    from deepshade_workers.references.ao import REFERENCES
+def _watched(steps: Iterator[tuple[int, int]], *, hidden: bool) -> tuple[int, int]:
+    """Samples (done, newly rendered) after all `steps` of (done, in all).
 
-    for effect in effects:
-        if effect not in REFERENCES:
-            raise ConfigError(
-                effect,
-                REFERENCES,
-                detail=f"no reference for {effect!r}; there are: {', '.join(REFERENCES)}",
-            )
-    return effects
+    They show as a bar on a terminal, as a line every 15 s elsewhere.
+    """
+    from rich import progress
+    from rich.console import Console
 
-
-class _progress:
-    """A bar with rate and time left on a terminal, a line every 15 s elsewhere."""
-
-    def __init__(self, *, hidden: bool) -> None:
-        from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
-        self.console = Console(stderr=True)
-        self.plain = not self.console.is_terminal
-        self.hidden = hidden
-        self.last = self.begun = time.monotonic()
-        self.first: int | None = None
-        self.bar = Progress(
-            TextColumn("rendering"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=self.console,
-            disable=self.plain or hidden,
-        )
-        self.task = self.bar.add_task("", total=None, rate="")
-
-    def __enter__(self) -> Any:
-        self.bar.start()
-        return self.report
-
-    def __exit__(self, *_: object) -> None:
-        self.bar.stop()
-
-    def report(self, done: int, total: int) -> None:
-        from deepshade_workers.datagen import rate
-
-        self.first = done if self.first is None else self.first
-        speed = rate(done - self.first, self.begun)
-        self.bar.update(self.task, completed=done, total=total, rate=f"{speed:.2f}/s")
-        now = time.monotonic()
-        if self.plain and not self.hidden and now - self.last > 15:
-            self.last = now
-            left = f"{(total - done) / speed / 60:.1f} min left" if speed else ""
-            self.console.print(f"rendering {done}/{total}  {speed:.2f}/s  {left}", style=None)
+    console = Console(stderr=True)
+    plain = not console.is_terminal
+    columns = ("rendering", progress.BarColumn(), progress.MofNCompleteColumn())
+    times = ("{task.fields[rate]}", progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
+    begun = said = time.monotonic()
+    first, done = None, 0
+    with progress.Progress(*columns, *times, console=console, disable=plain or hidden) as bar:
+        task = bar.add_task("", total=None, rate="")
+        for done, total in steps:
+            first = done if first is None else first
+            now = time.monotonic()
+            rate = (done - first) / max(now - begun, 1e-9)
+            bar.update(task, completed=done, total=total, rate=f"{rate:.2f}/s")
+            if plain and not hidden and now - said > 15:
+                said = now
+                left = f"{(total - done) / rate / 60:.1f} min left" if rate else ""
+                console.print(f"rendering {done}/{total}  {rate:.2f}/s  {left}")
+    return done, done - (first or 0)

@@ -6,8 +6,7 @@ import itertools
 import math
 import os
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,17 +17,19 @@ import numpy as np
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import NAME, Manifest, Shard
+from deepshade_workers.references import require
 from deepshade_workers.scenes.loading import PROCEDURAL, SUFFIXES, parse_procedural
 from deepshade_workers.scenes.procedural import FAMILIES
-from deepshade_workers.shards import Images, schema, shard_name, write_shard
+from deepshade_workers.shards import schema, shard_name, write_shard
+from deepshade_workers.view import Images, Vector
 
 # How often a sample whose scene shows nothing useful may ask for another scene.
 SCENE_TRIES = 16
 
 
 @dataclass(frozen=True)
-class Job:
-    """What a data set holds; two equal jobs make equal bytes.
+class DataSpec:
+    """What a data set holds; two equal ones make equal bytes.
 
     `scenes` are files, or `procedural:<family>`; `size` is a sample's side and `frame` that of
     the view it is cut from, in pixels; `radius` None draws one for each view.
@@ -57,6 +58,7 @@ class Job:
             raise ConfigError("seed", detail=f"the seed must be 0 or more, not {self.seed}")
         if self.radius is not None and not (math.isfinite(self.radius) and self.radius > 0):
             raise ConfigError("radius", detail=f"the radius must be above 0, not {self.radius}")
+        require(self.effects)
         if not self.scenes:
             raise ConfigError("scenes", detail="no scenes were given: --scenes procedural, say")
 
@@ -102,18 +104,20 @@ def expand_scenes(names: list[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def make_sample(job: Job, index: int) -> tuple[Images, dict[str, Any]]:
+def make_sample(
+    spec: DataSpec, index: int, *, displacements: Mapping[str, Vector] | None = None
+) -> tuple[Images, dict[str, Any]]:
     """Render sample `index`: its images and the record that makes it again.
 
     The sample's own random stream picks scene, view, radius and noise, so it doesn't matter
-    which worker renders it, or when.
+    which worker renders it, or when. `displacements` move the scene's objects (`view.View`).
     """
     from deepshade_workers.sample import render_sample
     from deepshade_workers.scenes.loading import open_scene
-    from deepshade_workers.views import sample_view
+    from deepshade_workers.viewpoints import sample_view
 
-    rng = np.random.default_rng([job.seed, index])
-    choice = job.scenes[index % len(job.scenes)]
+    rng = np.random.default_rng([spec.seed, index])
+    choice = spec.scenes[index % len(spec.scenes)]
     for attempt in range(SCENE_TRIES):
         fresh = choice.startswith(PROCEDURAL) and choice.count(":") == 1
         name = f"{choice}:{int(rng.integers(2**31))}" if fresh else choice
@@ -122,33 +126,27 @@ def make_sample(job: Job, index: int) -> tuple[Images, dict[str, Any]]:
             view = sample_view(
                 scene,
                 rng,
-                frame=job.frame,
-                size=job.size,
-                radius=job.radius,
-                min_contrast=job.min_contrast,
+                frame=spec.frame,
+                size=spec.size,
+                radius=spec.radius,
+                min_contrast=spec.min_contrast,
+                displacements=displacements,
             )
             break
         except SceneError:
             if attempt == SCENE_TRIES - 1:
                 raise
             # One bare scene shall not end a long job: another takes its place.
-            choice = job.scenes[int(rng.integers(len(job.scenes)))]
+            choice = spec.scenes[int(rng.integers(len(spec.scenes)))]
     noise = int(rng.integers(2**63))
-    images, _ = render_sample(
-        scene,
-        view.camera,
-        job.size,
-        job.size,
-        effects=job.effects,
-        radius=view.radius,
-        samples=job.spp,
-        seed=noise,
+    images = render_sample(
+        scene, view, spec.size, spec.size, effects=spec.effects, samples=spec.spp, seed=noise
     )
     camera = view.camera
-    record = {
+    record: dict[str, Any] = {
         "scene": name,
         "seed": noise,
-        "radius": view.radius,
+        **view.settings(),
         "camera": {
             "fov": camera.fov,
             "frame": [camera.width, camera.height],
@@ -156,35 +154,37 @@ def make_sample(job: Job, index: int) -> tuple[Images, dict[str, Any]]:
             "world_to_camera": camera.matrix.tolist(),
         },
     }
+    if view.displacements:
+        record["displacements"] = {key: list(value) for key, value in view.displacements.items()}
     return images, record
 
 
-def make_shard(job: Job, index: int, folder: Path, tick: Callable[[], object]) -> Shard:
+def make_shard(spec: DataSpec, index: int, folder: Path, tick: Callable[[], object]) -> Shard:
     """Render and write shard `index`; calls `tick` after each sample."""
-    tensors = list(schema(job.effects, job.size))
+    tensors = schema(spec.effects, spec.size)
     images, records = [], []
-    for number in job.samples(index):
-        sample, record = make_sample(job, number)
+    for number in spec.samples(index):
+        sample, record = make_sample(spec, number)
         images.append({name: sample[name] for name in tensors})
         records.append(record)
         tick()
     return write_shard(folder, index, tensors, images, records)
 
 
-def open_manifest(job: Job, folder: Path) -> Manifest:
-    """The manifest to go on with: that of `folder` if the same job made it, else a new one.
+def open_manifest(spec: DataSpec, folder: Path) -> Manifest:
+    """The manifest to go on with: that of `folder` if the same settings made it, else a new one.
 
-    A data set may grow: more views than it was begun with are the same job.
+    A data set may grow: more views than it was begun with are the same spec.
 
     Raises:
         DataError: the folder holds a data set of other settings.
     """
     if not (folder / NAME).exists():
-        return Manifest(job.settings(), schema(job.effects, job.size))
+        return Manifest(spec.settings(), schema(spec.effects, spec.size))
     manifest = Manifest.read(folder)
-    theirs, ours = manifest.settings, job.settings()
+    theirs, ours = manifest.settings, spec.settings()
     differing = [key for key in ours if theirs.get(key) != ours[key]]
-    if differing == ["views"] and theirs["views"] < job.views:
+    if differing == ["views"] and theirs["views"] < spec.views:
         return Manifest(ours, manifest.schema, manifest.shards)
     if differing:
         was = ", ".join(f"{key} {theirs.get(key)!r}" for key in differing)
@@ -195,8 +195,10 @@ def open_manifest(job: Job, folder: Path) -> Manifest:
     return manifest
 
 
-def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[tuple[int, int]]:
-    """Render what is missing of `job` into `folder` on a Ray cluster.
+def generate(
+    spec: DataSpec, folder: Path, *, address: str | None = None
+) -> Iterator[tuple[int, int]]:
+    """Render what is missing of `spec` into `folder` on a Ray cluster.
 
     `address` is a running cluster's; None takes RAY_ADDRESS, or else starts a cluster in this
     process. All nodes must see `folder` and the scenes under the same paths. Yields (samples
@@ -210,12 +212,12 @@ def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[
 
     folder = folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    manifest = open_manifest(job, folder)
+    manifest = open_manifest(spec, folder)
     for leftover in folder.glob(".*.tmp"):  # of a job killed while it wrote
         leftover.unlink(missing_ok=True)
-    missing = [k for k in range(job.shards) if not _complete(job, k, manifest, folder)]
-    ready = job.views - sum(len(job.samples(k)) for k in missing)
-    yield ready, job.views
+    missing = [k for k in range(spec.shards) if not _complete(spec, k, manifest, folder)]
+    ready = spec.views - sum(len(spec.samples(k)) for k in missing)
+    yield ready, spec.views
     if not missing:
         return
     _connect(address)
@@ -224,13 +226,14 @@ def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[
         tally = tally.remote()
         task = ray.remote(num_cpus=1, max_retries=5)(_shard_task)
         # A few at a time: a kill then loses little, and the cluster's memory stays flat.
-        slots = max(1, 2 * int(_resources().get("CPU", 1)))
+        resources = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        slots = max(1, 2 * int(resources.get("CPU", 1)))
         running: list[Any] = []
         counted = ready
         waiting = iter(missing)
         while True:
             for k in itertools.islice(waiting, slots - len(running)):
-                running.append(task.remote(job, k, str(folder), str(Path.cwd()), tally))
+                running.append(task.remote(spec, k, str(folder), str(Path.cwd()), tally))
             if not running:
                 break
             finished, running = ray.wait(running, num_returns=1, timeout=0.5)
@@ -239,16 +242,16 @@ def generate(job: Job, folder: Path, *, address: str | None = None) -> Iterator[
                 manifest.write(folder)
             with suppress(ray.exceptions.RayActorError):  # restarting; counts come back
                 counted = max(counted, ready + ray.get(tally.total.remote()))
-            yield min(counted, job.views), job.views
-        yield job.views, job.views
+            yield min(counted, spec.views), spec.views
+        yield spec.views, spec.views
     finally:
         ray.shutdown()
 
 
-def _complete(job: Job, index: int, manifest: Manifest, folder: Path) -> bool:
+def _complete(spec: DataSpec, index: int, manifest: Manifest, folder: Path) -> bool:
     return any(
         shard.file == shard_name(index)
-        and len(shard.samples) == len(job.samples(index))
+        and len(shard.samples) == len(spec.samples(index))
         and (folder / shard.file).is_file()
         and sha256(folder / shard.file) == shard.sha256
         for shard in manifest.shards
@@ -270,7 +273,7 @@ class Tally:
         return sum(self.counts.values())
 
 
-def _shard_task(job: Job, index: int, folder: str, home: str, tally: Any) -> Shard:
+def _shard_task(spec: DataSpec, index: int, folder: str, home: str, tally: Any) -> Shard:
     import drjit as dr
 
     from deepshade_workers.backend import mitsuba
@@ -285,7 +288,7 @@ def _shard_task(job: Job, index: int, folder: str, home: str, tally: Any) -> Sha
         count += 1
         tally.set.remote(index, count)
 
-    return make_shard(job, index, Path(folder), tick)
+    return make_shard(spec, index, Path(folder), tick)
 
 
 def _result(reference: Any) -> Shard:
@@ -321,15 +324,3 @@ def _knock(address: str) -> None:
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdigit():
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
-
-
-def _resources() -> dict[str, float]:
-    import ray
-
-    found: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
-    return found
-
-
-def rate(done: int, since: float) -> float:
-    """Samples a second since the time `since` (time.monotonic)."""
-    return done / max(time.monotonic() - since, 1e-9)

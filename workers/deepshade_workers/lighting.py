@@ -7,12 +7,12 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from deepshade_workers.backend import mitsuba
-from deepshade_workers.references.ao import offset_origin, pixel_streams, random_pair
+from deepshade_workers.sampling import pixel_streams, random_pair
 from deepshade_workers.scenes.scene import Scene
-from deepshade_workers.trace import Hits, material
+from deepshade_workers.trace import Hits, material, offset_origin
+from deepshade_workers.view import Image
 
 mi = mitsuba()
 
@@ -56,12 +56,11 @@ class Phong:
         return self.specular * (self.gloss + 2) * dr.inv_two_pi * lobe
 
 
-def direct_light(
-    scene: Scene, hits: Hits, *, samples: int, seed: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def direct_light(scene: Scene, hits: Hits, *, samples: int, seed: int) -> tuple[Image, Image]:
     """Radiance toward the camera after one bounce of the lights: L and its diffuse part L_diff.
 
-    Both are (3, N), linear; pixels without a hit hold 0. A scene without lights of its own has
+    Both are (3, H, W), linear. Where there is no surface L is the sky's radiance (without the
+    sun's disc; 0 if the scene has no sky) and L_diff is 0. A scene without lights of its own has
     the default sun and sky, and a lamp at the camera so that closed rooms aren't black.
     """
     phong = Phong.at(hits)
@@ -73,7 +72,10 @@ def direct_light(
         arriving = LAMP * dr.square(median / hits.surface.t) * dr.maximum(local.z, 0)
         part += phong.diffuse * dr.inv_pi * arriving
         shone += phong.shine(local) * arriving
-    return _image(part + shone, hits), _image(part, hits)
+    sky = scene.traced.environment()
+    seen = mi.Color3f(0) if sky is None else sky.eval(hits.surface, ~hits.valid)
+    light = dr.select(hits.valid, part + shone, seen)
+    return hits.planar(light), hits.planar(dr.select(hits.valid, part, 0))
 
 
 def toward_camera(hits: Hits) -> Any:
@@ -113,7 +115,3 @@ def _sample_lights(
         shone += brighter
         index += 1
     return part / samples, shone / samples
-
-
-def _image(colour: Any, hits: Hits) -> NDArray[np.float32]:
-    return np.asarray(dr.select(hits.valid, colour, 0).numpy(), np.float32)

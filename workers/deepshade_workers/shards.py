@@ -4,42 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.files import replacing
 from deepshade.manifest import Shard
-
-Images = dict[str, NDArray[np.float32]]
-
-# Absolute positions and depths need more than fp16's 11 bits; everything else fits.
-WIDE = {"position", "depth"}
-
-
-def dtype_of(tensor: str) -> type[np.floating[Any]]:
-    """float32 for lengths in scene units, float16 for what is bounded."""
-    return np.float32 if tensor in WIDE else np.float16
+from deepshade_workers.view import Images
 
 
 def schema(effects: Sequence[str], size: int) -> dict[str, dict[str, Any]]:
     """Tensors of a data set for `effects`: their inputs, references and errors."""
     tensors: dict[str, dict[str, Any]] = {}
-    for effect in effects:
-        for name in EFFECTS[effect].inputs:
-            tensors[name] = _entry(name, len(ATTRIBUTES[name].channels), size)
-        for name in (f"reference_{effect}", f"reference_{effect}_error"):
-            tensors[name] = _entry(name, len(EFFECTS[effect].outputs), size)
+    for row in (EFFECTS[effect] for effect in effects):
+        for attribute in (ATTRIBUTES[name] for name in row.inputs):
+            shape = [len(attribute.channels), size, size]
+            tensors[attribute.name] = {"dtype": attribute.unit.storage, "shape": shape}
+        for name in (f"reference_{row.name}", f"reference_{row.name}_error"):
+            tensors[name] = {"dtype": row.storage, "shape": [len(row.outputs), size, size]}
     return tensors
-
-
-def _entry(name: str, channels: int, size: int) -> dict[str, Any]:
-    return {"dtype": np.dtype(dtype_of(name)).name, "shape": [channels, size, size]}
 
 
 def shard_name(index: int) -> str:
@@ -50,15 +37,18 @@ def shard_name(index: int) -> str:
 def write_shard(
     folder: Path,
     index: int,
-    tensors: Sequence[str],
+    tensors: Mapping[str, dict[str, Any]],
     images: Sequence[Images],
     records: list[dict[str, Any]],
 ) -> Shard:
-    """Write shard `index` from planar (C, H, W) `images`; the same input gives the same bytes."""
+    """Write shard `index`: of each of `images` the planar (C, H, W) `tensors` of a `schema`.
+
+    The same input gives the same bytes.
+    """
     from safetensors.numpy import save
 
     stacked = {
-        name: np.stack([sample[name] for sample in images]).astype(dtype_of(name))
+        name: np.stack([sample[name] for sample in images]).astype(tensors[name]["dtype"])
         for name in sorted(tensors)
     }
     content = save(stacked, metadata={"samples": json.dumps(records, sort_keys=True)})

@@ -1,4 +1,4 @@
-"""Primary hits: what each pixel's centre sees."""
+"""Rays: what each pixel's centre sees, and where rays that leave a surface start."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from deepshade.camera import Camera, rotation_of
 from deepshade_workers.backend import mitsuba
-from deepshade_workers.scenes.scene import MATERIAL_CHANNELS, Scene
+from deepshade_workers.scenes.scene import Scene
+from deepshade_workers.view import Image
 
 mi = mitsuba()
+
+# Offset of ray origins against self-intersection, relative to the larger of the scene's size and
+# the point's coordinates: float32 resolves 2^-23 of them and intersection loses a few bits more.
+ORIGIN_OFFSET = 2.0**-19
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,10 @@ class Hits:
     depth: Any
     back: Any
     surface: Any
+
+    def planar(self, values: Any) -> Image:
+        """(C, H, W) float32 of a Dr.Jit array with a value or colour for each pixel."""
+        return np.asarray(values.numpy().reshape(-1, self.height, self.width), np.float32)
 
 
 def trace(scene: Scene, camera: Camera, width: int, height: int) -> Hits:
@@ -58,30 +66,18 @@ def trace(scene: Scene, camera: Camera, width: int, height: int) -> Hits:
     return Hits(width, height, valid, si.p, ng, ns, depth, back, si)
 
 
-def attributes(hits: Hits, camera: Camera) -> dict[str, NDArray[np.float32]]:
-    """`position`, `normal`, `depth` and the Phong material of `hits`, planar (C, H, W).
-
-    Background pixels hold 0, but infinite depth.
-    """
-    valid = hits.valid.numpy()
-    depth = np.where(valid, hits.depth.numpy(), np.inf).reshape(1, hits.height, hits.width)
-    rays = camera.rays(hits.width, hits.height)
-    normal = rotation_of(camera.matrix) @ hits.ns.numpy().astype(np.float64)
-    result = {
-        "position": rays * np.where(valid.reshape(depth.shape), depth, 0),
-        "normal": _planar(np.where(valid, normal, 0), hits),
-        "depth": depth,
-    }
-    for name, (start, stop) in MATERIAL_CHANNELS.items():
-        result[name] = _planar(material(hits, name, stop - start).numpy() * valid, hits)
-    return {name: np.ascontiguousarray(value, np.float32) for name, value in result.items()}
+def offset_origin(point: Any, normal: Any, scene: Scene) -> Any:
+    """Move `point` off its surface along the geometric `normal`, relative to magnitudes."""
+    diagonal = dr.opaque(mi.Float, scene.diagonal)
+    magnitude = dr.maximum(dr.max(dr.abs(point)), diagonal)
+    return dr.fma(normal, magnitude * ORIGIN_OFFSET, point)
 
 
 def material(hits: Hits, name: str, channels: int) -> Any:
-    """A Phong term at the hits, as a Dr.Jit array of 1 or 3 channels.
+    """A Phong term or the "object" number at the hits: a Dr.Jit array of 1 or 3 channels.
 
     Our meshes carry it per face. A Mitsuba XML scene's shapes tell only their diffuse
-    reflectance; their other terms are 0.
+    reflectance; all else is 0.
     """
     shape, si = hits.surface.shape, hits.surface
     key = f"face_{name}"
@@ -92,7 +88,3 @@ def material(hits: Hits, name: str, channels: int) -> Any:
     if name == "diffuse":
         other = si.bsdf().eval_diffuse_reflectance(si, hits.valid)
     return dr.select(known, shape.eval_attribute_3(key, si, known), other)
-
-
-def _planar(values: NDArray[np.float32], hits: Hits) -> NDArray[np.float32]:
-    return values.reshape(-1, hits.height, hits.width)

@@ -2,7 +2,7 @@
 
     from deepshade.engines import choose, load_engine
 
-    engine = load_engine(bundle, choose(), threads=cpu_count())
+    engine = load_engine(bundle, choose(bundle), threads=cpu_count())
     engine.warm()
     shade = engine.predict(gbuffer)  # (N, C, H, W) float32 to (N, C', H, W) float32
 

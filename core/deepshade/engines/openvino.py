@@ -26,11 +26,12 @@ import numpy as np
 
 from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine, Float
+from deepshade.engines.quantising import quantise
 from deepshade.engines.splitting import split
 from deepshade.errors import EngineError
+from deepshade.machine import cpu_kind
 
-_TYPES = {"bf16": "bf16", "fp32": "f32"}
-_CAPABILITIES = {"bf16": "BF16", "fp32": "FP32"}
+_CAPABILITIES = {"bf16": "BF16", "int8": "INT8", "fp32": "FP32"}
 # How many compiled sizes are kept, and the input pixels for which memory is kept, over all.
 MAX_SIZES = 16
 MAX_LIVE_PIXELS = 4 * 2**20
@@ -39,8 +40,14 @@ Shape = tuple[int, ...]
 
 
 def precisions(engine: str = "openvino") -> tuple[str, ...]:
-    """What this CPU does natively. Raises EngineError where OpenVINO isn't installed."""
+    """What this CPU does natively, and rightly. Raises EngineError where OpenVINO isn't installed.
+
+    Not 8 bits with AMX: with 2026.4.1 two of three AO bundles came out 18 and 30 % worse there,
+    and none faster than in bf16.
+    """
     known = set(_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"))
+    if cpu_kind() == "amx":
+        known.discard("INT8")
     return tuple(name for name, capability in _CAPABILITIES.items() if capability in known)
 
 
@@ -54,9 +61,13 @@ class OpenVino(Engine):
 
     def __init__(self, bundle: Bundle, backend: Backend, *, threads: int) -> None:
         super().__init__(bundle, backend, threads=threads)
-        self._type = _TYPES[backend.precision]
+        # What 8 bits leave out runs in the CPU's own 16 bits, if it has them.
+        in_16_bits = backend.precision != "fp32" and "bf16" in precisions()
+        self._type = "bf16" if in_16_bits else "f32"
         try:
             self._model = _core().read_model(str(bundle.model))
+            if backend.precision == "int8":
+                quantise(self._model, bundle.int8)
         except RuntimeError as error:
             raise EngineError(f"OpenVINO can't read {bundle.model}: {_reason(error)}") from error
         self._lock = threading.Lock()

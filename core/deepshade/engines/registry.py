@@ -9,6 +9,7 @@ from typing import Protocol, cast
 from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine
 from deepshade.errors import EngineError, nearest
+from deepshade.machine import cpu_kind
 
 # What every machine with the service has, and what the others are measured against.
 REFERENCE = Backend("onnxruntime", "fp32")
@@ -31,11 +32,7 @@ class _Module(Protocol):
 
 @cache
 def available() -> tuple[Backend, ...]:
-    """The backends of this machine, in the order of the rule that chooses among them.
-
-    CUDA where there is a GPU, else OpenVINO, else ONNX Runtime; bf16 where the CPU calculates in
-    it, else fp32. The rule looks at the machine alone, so a request gets the same bytes always.
-    """
+    """The backends of this machine, in the order of the rule that chooses among them."""
     found: list[Backend] = []
     for engine in _ENGINES:
         try:
@@ -45,15 +42,25 @@ def available() -> tuple[Backend, ...]:
     return tuple(found)
 
 
-def choose(engine: str | None = None, precision: str | None = None) -> Backend:
-    """The first available backend that is as asked. Raises EngineError if none is."""
-    for backend in available():
-        if engine in (None, backend.engine) and precision in (None, backend.precision):
+def choose(bundle: Bundle, engine: str | None = None, precision: str | None = None) -> Backend:
+    """The backend that a bundle runs on here: the first of the rule that is as asked.
+
+    CUDA where there is a GPU, else OpenVINO, else ONNX Runtime; bf16 where the CPU calculates in
+    it, else 8 bits where the bundle was found to lose little by them on this kind of CPU, else
+    fp32. The rule looks at the machine and the bundle alone, so a request gets the same bytes
+    always. Raises EngineError if none is as asked.
+    """
+    able = [b for b in available() if b.precision != "int8" or bundle.int8]
+    for backend in able:
+        unproven = backend.precision == "int8" and cpu_kind() not in bundle.int8_kinds
+        if engine not in (None, backend.engine) or precision not in (None, backend.precision):
+            continue
+        if not unproven or precision == "int8":
             return backend
     asked = "/".join(part or "*" for part in (engine, precision))
-    here = ", ".join(map(str, available()))
+    here = ", ".join(map(str, able))
     raise EngineError(
-        f"no '{asked[:100]}' on this machine" if here else "no engine is installed",
+        f"no '{asked[:100]}' for this bundle on this machine" if here else "no engine is installed",
         fix=f"one of: {here}" if here else "pip install 'deepshade[service]'",
     )
 
@@ -75,6 +82,11 @@ def load_engine(bundle: Bundle, backend: Backend, *, threads: int) -> Engine:
         raise EngineError(
             f"'{backend.engine}' has no precision '{backend.precision}' on this machine",
             fix=f"one of: {', '.join(precisions)}",
+        )
+    if backend.precision == "int8" and not bundle.int8:
+        raise EngineError(
+            f"the bundle {bundle.effect}/{bundle.name} has no ranges for 8 bits",
+            fix="export it again, or choose another precision",
         )
     return _module(backend.engine).load(bundle, backend, threads)
 

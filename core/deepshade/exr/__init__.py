@@ -1,17 +1,9 @@
 """OpenEXR images in and out: `read_header`, `read`, `write`, within `Limits`."""
 
-from deepshade.exr.image import (
-    COMPRESSIONS,
-    Header,
-    Image,
-    Limits,
-    Part,
-    Window,
-    fetch,
-    read,
-    read_header,
-    write,
-)
+from deepshade.exr.chunks import Window
+from deepshade.exr.header import Header, Part
+from deepshade.exr.image import COMPRESSIONS, Image, fetch, read, read_header, write
+from deepshade.exr.limits import Limits
 
 __all__ = [
     "COMPRESSIONS",

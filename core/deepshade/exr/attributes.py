@@ -6,7 +6,6 @@ Layout: "OpenEXR File Layout", openexr.com/en/latest/OpenEXRFileLayout.html.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,8 +16,8 @@ from deepshade.exr.limits import Limits
 
 Buffer = memoryview
 
-MOST_ATTRIBUTES = 4_000  # of all parts; the busiest production files have a few hundred
-_MOST_TEXTS = 4_000  # in one attribute
+MAX_ATTRIBUTES = 4_000  # of all parts; the busiest production files have a few hundred
+MAX_TEXTS = 4_000  # in one attribute
 _TYPES = ("uint", "half", "float")
 
 
@@ -38,14 +37,14 @@ class RawPart:
 
 
 class Cursor:
-    """A place in the bytes that can't run past their end."""
+    """A reading position in bytes; raises DamagedImageError instead of running past their end."""
 
     def __init__(self, data: Buffer, at: int) -> None:
         self.data = data
         self.at = at
 
     def skip(self, count: int) -> int:
-        """Moves on by `count` bytes, which must be there; where it was."""
+        """The position before it moves on by `count` bytes."""
         start = self.at
         if count < 0 or count > len(self.data) - start:
             raise truncated("within the header")
@@ -57,13 +56,13 @@ class Cursor:
         return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout)))
 
     def peek(self) -> int:
-        """The next byte, which stays the next."""
+        """The next byte, without moving on."""
         if self.at >= len(self.data):
             raise truncated("within the header")
         return self.data[self.at]
 
     def name(self) -> str:
-        """The next text, which a zero byte ends."""
+        """The next zero-terminated text of up to 255 bytes."""
         window = bytes(self.data[self.at : self.at + 256])
         end = window.find(b"\0")
         if end < 0:
@@ -74,16 +73,16 @@ class Cursor:
         return window[:end].decode("utf-8", "replace")
 
     def table(self, count: int) -> int:
-        """Where the chunk table of that many entries begins, which must be here."""
+        """The position of the chunk table of `count` entries that is next; moves behind it."""
         if count > (len(self.data) - self.at) // 8:
             raise truncated("within the chunk table")
         return self.skip(8 * count)
 
 
-def read_part(cursor: Cursor, limits: Limits, most: int) -> RawPart:
-    """One part's header, which may have at most `most` attributes."""
+def read_part(cursor: Cursor, limits: Limits, limit: int) -> RawPart:
+    """One part's header of at most `limit` attributes."""
     raw = RawPart()
-    for _ in range(most + 1):
+    for _ in range(limit + 1):
         name = cursor.name()
         if not name:
             return raw
@@ -97,15 +96,15 @@ def read_part(cursor: Cursor, limits: Limits, most: int) -> RawPart:
         raw.values[name] = value
         if name == "channels" and kind == "chlist":
             _read_channels(value, raw, limits)
-        elif kind in _DECODERS:
-            try:
-                raw.attributes[name] = _DECODERS[kind](value)
-            except (struct.error, ValueError, IndexError):
-                raise DamagedImageError(
-                    f"the header attribute '{name}' is no valid {kind}"
-                ) from None
+            continue
+        try:
+            meant = _value(kind, value)
+        except (struct.error, ValueError):
+            raise DamagedImageError(f"the header attribute '{name}' is no valid {kind}") from None
+        if meant is not None:
+            raw.attributes[name] = meant
     raise ImageError(
-        f"the header has over {MOST_ATTRIBUTES:,} attributes", fix="save it without metadata"
+        f"the header has over {MAX_ATTRIBUTES:,} attributes", fix="save it without metadata"
     )
 
 
@@ -133,59 +132,50 @@ def truncated(where: str) -> DamagedImageError:
     return DamagedImageError(f"the image is truncated, {where}", fix="send the whole file again")
 
 
-def _text(value: Buffer) -> str:
-    return bytes(value).decode("utf-8", "replace")
+def _value(kind: str, value: Buffer) -> Any:
+    """An attribute of a known type; None for another. Raises what struct and numpy raise."""
+    if layout := _LAYOUTS.get(kind):
+        found = struct.unpack(layout, value)
+        return found[0] if len(found) == 1 else found
+    if matrix := _MATRICES.get(kind):
+        return np.frombuffer(bytes(value), matrix[0]).reshape(matrix[1:])
+    if kind == "string":
+        return bytes(value).decode("utf-8", "replace")
+    return _texts(value) if kind == "stringvector" else None
 
 
 def _texts(value: Buffer) -> list[str]:
     cursor = Cursor(value, 0)
     out: list[str] = []
     while cursor.at < len(value):
-        if len(out) == _MOST_TEXTS:
+        if len(out) == MAX_TEXTS:
             raise ValueError
         (size,) = cursor.unpack("<i")
         start = cursor.skip(size)
-        out.append(_text(value[start : start + size]))
+        out.append(bytes(value[start : start + size]).decode("utf-8", "replace"))
     return out
 
 
-def _scalar(layout: str) -> Callable[[Buffer], Any]:
-    return lambda value: struct.unpack(layout, value)[0]
-
-
-def _tuple(layout: str) -> Callable[[Buffer], Any]:
-    return lambda value: struct.unpack(layout, value)
-
-
-def _matrix(kind: str, size: int) -> Callable[[Buffer], Any]:
-    return lambda value: np.frombuffer(bytes(value), kind).reshape(size, size)
-
-
-_DECODERS: dict[str, Callable[[Buffer], Any]] = {
-    "string": _text,
-    "stringvector": _texts,
-    "int": _scalar("<i"),
-    "float": _scalar("<f"),
-    "double": _scalar("<d"),
-    "compression": _scalar("<B"),
-    "lineOrder": _scalar("<B"),
-    "envmap": _scalar("<B"),
-    "v2i": _tuple("<2i"),
-    "v2f": _tuple("<2f"),
-    "v2d": _tuple("<2d"),
-    "v3i": _tuple("<3i"),
-    "v3f": _tuple("<3f"),
-    "v3d": _tuple("<3d"),
-    "box2i": _tuple("<4i"),
-    "box2f": _tuple("<4f"),
-    "m33f": _matrix("<f4", 3),
-    "m33d": _matrix("<f8", 3),
-    "m44f": _matrix("<f4", 4),
-    "m44d": _matrix("<f8", 4),
-    "chromaticities": _tuple("<8f"),
-    "rational": _tuple("<iI"),
-    "timecode": _tuple("<2I"),
-    "keycode": _tuple("<7i"),
-    "tiledesc": _tuple("<2IB"),
-    "floatvector": lambda value: np.frombuffer(bytes(value), "<f4"),
+_LAYOUTS = {
+    "int": "<i",
+    "float": "<f",
+    "double": "<d",
+    "compression": "<B",
+    "lineOrder": "<B",
+    "envmap": "<B",
+    "v2i": "<2i",
+    "v2f": "<2f",
+    "v2d": "<2d",
+    "v3i": "<3i",
+    "v3f": "<3f",
+    "v3d": "<3d",
+    "box2i": "<4i",
+    "box2f": "<4f",
+    "tiledesc": "<2IB",
+}
+_MATRICES = {
+    "m33f": ("<f4", 3, 3),
+    "m33d": ("<f8", 3, 3),
+    "m44f": ("<f4", 4, 4),
+    "m44d": ("<f8", 4, 4),
 }

@@ -67,7 +67,7 @@ class Chunks:
         return (0 if self.number is None else 4) + (20 if self.tiled else 8)
 
     def table(self, data: Buffer) -> NDArray[np.uint64]:
-        """Where each chunk begins."""
+        """Each chunk's position in the file."""
         return np.frombuffer(data, "<u8", self.count, self.table_at)
 
     def lines_of(self, first: int, last: int) -> slice:
@@ -116,7 +116,7 @@ _WINDOW = b"dataWindow\0box2i\0" + struct.pack("<i", 16)
 
 
 def header_of(raw: RawPart, *, tiled: bool) -> bytes:
-    """The beginning of a single-part file with this part's pixels; window and end are missing."""
+    """The header of a single-part file with this part's pixels, without data window and end."""
     pieces = [struct.pack("<2I", MAGIC, 2 | LONG_NAMES | (TILED if tiled else 0))]
     for name in _NEEDED:
         if name in raw.values:
@@ -151,7 +151,7 @@ def check(data: Buffer, chunks: Chunks, first: int) -> None:
 def _check_block(
     data: Buffer, chunks: Chunks, table: NDArray[np.uint64], start: int, first: int
 ) -> int:
-    """The bytes of these chunks; `table` holds the entries from `start` on."""
+    """How many bytes these chunks take; `table` holds the entries from `start` on."""
     head = chunks.head
     if int(table.min()) < first or int(table.max()) > len(data) - head:
         raise truncated("or its chunk table is damaged")

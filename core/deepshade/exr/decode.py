@@ -23,18 +23,10 @@ Repeats = Mapping[int, Sequence[int]]
 
 # Bytes decoded at a time, with all the part's channels. Smaller strips take less memory and keep
 # more threads busy; but opening the library's file for each takes some 50 µs.
-_MOST = 8 * 2**20
-_LEAST = 2**20
+MAX_STRIP = 8 * 2**20
+MIN_STRIP = 2**20
 
-# Bytes of a decoded chunk from which on it is decoded once if it is there several times: less
-# is decoded sooner than set apart.
-_WORTH_COMPARING = 2**14
-
-_TYPES: dict[str, np.dtype[Any]] = {
-    "half": np.dtype("<f2"),
-    "float": np.dtype("<f4"),
-    "uint": np.dtype("<u4"),
-}
+_TYPES = {"half": "<f2", "float": "<f4", "uint": "<u4"}
 
 
 @dataclass(slots=True)
@@ -60,12 +52,13 @@ def decode(data: bytes, wanted: Sequence[Wanted]) -> None:
         each.part.decoded_bytes * len(rows) // each.part.chunks.rows
         for each, (rows, _) in zip(wanted, distinct, strict=True)
     ]
-    piece = min(_MOST, max(_LEAST, -(-sum(shares) // threads)))
-    strips = [
-        (each, strip, repeats)
-        for each, (rows, repeats), share in zip(wanted, distinct, shares, strict=True)
-        for strip in _strips(each.part, rows, -(-share // piece))
-    ]
+    piece = min(MAX_STRIP, max(MIN_STRIP, -(-sum(shares) // threads)))
+    strips: list[tuple[Wanted, Sequence[int], Repeats]] = []
+    for each, (rows, repeats), share in zip(wanted, distinct, shares, strict=True):
+        # subsampled lines must not be counted from the top of a strip
+        count = 1 if each.part.subsampled else min(-(-share // piece), len(rows))
+        bounds = [len(rows) * k // count for k in range(count + 1)]
+        strips += [(each, rows[a:b], repeats) for a, b in itertools.pairwise(bounds)]
     run_all(lambda strip: _decode(data, *strip), strips, threads)
 
 
@@ -74,8 +67,6 @@ def _distinct(data: bytes, part: Part) -> tuple[Sequence[int], Repeats]:
     chunks = part.chunks
     every = range(chunks.rows)
     if part.tiled or part.subsampled or part.compression == "none":
-        return every, {}
-    if part.decoded_bytes < _WORTH_COMPARING * chunks.rows:
         return every, {}
     whole = part.shape[0] // chunks.height  # the last may have fewer scanlines than the others
     view = memoryview(data)
@@ -97,18 +88,10 @@ def _distinct(data: bytes, part: Part) -> tuple[Sequence[int], Repeats]:
     return [*rows, *every[whole:]], repeats
 
 
-def _strips(part: Part, rows: Sequence[int], count: int) -> list[Sequence[int]]:
-    """`count` runs of these rows of chunks, if there are as many and they can be cut."""
-    # subsampled lines must not be counted from the top of a strip
-    count = 1 if part.subsampled else min(count, len(rows))
-    bounds = [len(rows) * k // count for k in range(count + 1)]
-    return [rows[first:last] for first, last in itertools.pairwise(bounds)]
-
-
 def _runs(rows: Sequence[int]) -> list[range]:
     """Ascending rows as runs of consecutive ones."""
-    if isinstance(rows, range):
-        return [rows]
+    if rows[-1] - rows[0] < len(rows):
+        return [range(rows[0], rows[-1] + 1)]
     runs: list[range] = []
     for row in rows:
         if runs and runs[-1].stop == row:
@@ -129,9 +112,7 @@ def _decode(data: bytes, wanted: Wanted, rows: Sequence[int], repeats: Repeats) 
         if row in repeats
         for run in _runs(repeats[row])
     ]
-    stored = _uncompressed(data, wanted, rows[0], rows[-1] + 1)
-    if stored is None:
-        stored = _by_library(chunks.cut(memoryview(data), rows))
+    stored = _uncompressed(data, wanted, rows) or _by_library(chunks.cut(memoryview(data), rows))
     for name, plane in wanted.planes.items():
         pixels = stored.get(name)
         if pixels is None or pixels.shape != (height, plane.shape[1]):
@@ -157,39 +138,31 @@ def _by_library(data: bytes) -> dict[str, NDArray[Any]]:
     except MemoryError:
         raise
     except Exception as error:
+        text = str(error).replace('"<python_buffer>"', "").strip() or type(error).__name__
         raise DamagedImageError(
-            f"the image is damaged: {_reason(error)}", fix="save or send the file again"
+            f"the image is damaged: {text.splitlines()[0][:200]}", fix="save or send the file again"
         ) from error
 
 
-def _uncompressed(
-    data: bytes, wanted: Wanted, first: int, last: int
-) -> dict[str, NDArray[Any]] | None:
-    """The wanted channels as they lie in the bytes; None unless they lie there row after row."""
+def _uncompressed(data: bytes, wanted: Wanted, rows: Sequence[int]) -> dict[str, NDArray[Any]]:
+    """The wanted channels, copied out of the bytes; {} unless they lie there row after row."""
     part, chunks = wanted.part, wanted.part.chunks
     if part.compression != "none" or part.tiled or part.subsampled:
-        return None
+        return {}
     if list(part.channels) != sorted(part.channels):  # the library sorts them
-        return None
-    width, count = part.shape[1], last - first
-    types = {name: _TYPES[kind] for name, kind in part.channels.items()}
-    head = 8 if chunks.number is None else 12
-    size = width * sum(kind.itemsize for kind in types.values())
-    table = chunks.table(memoryview(data))[first:last].astype(np.int64)
-    if not (table == table[0] + (head + size) * np.arange(count)).all():
-        return None
-    rows = np.frombuffer(data, np.uint8, count * (head + size), int(table[0]))
-    rows = rows.reshape(count, head + size)
-    if not (np.ascontiguousarray(rows[:, head - 4 : head]).view("<i4") == size).all():
-        return None
-    stored: dict[str, NDArray[Any]] = {}
-    at = head
-    for name, kind in types.items():
-        end = at + width * kind.itemsize
-        if name in wanted.planes:
-            stored[name] = np.ascontiguousarray(rows[:, at:end]).view(kind)
-        at = end
-    return stored
+        return {}
+    names = list(part.channels)
+    formats = [(_TYPES[kind], (part.shape[1],)) for kind in part.channels.values()]
+    *offsets, step = itertools.accumulate(
+        (np.dtype(f).itemsize for f in formats), initial=chunks.head
+    )
+    places = chunks.places(memoryview(data), rows[0], rows[-1] + 1)
+    start = places[0][0]
+    if places != [(start + n * step, step - chunks.head) for n in range(len(places))]:
+        return {}
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    lines = np.frombuffer(data, layout, len(places), start - chunks.head)
+    return {name: np.ascontiguousarray(lines[name]) for name in wanted.planes}
 
 
 def _convert(stored: NDArray[Any], plane: Pixels) -> bool:
@@ -198,8 +171,3 @@ def _convert(stored: NDArray[Any], plane: Pixels) -> bool:
         return floats.to_float(stored, plane)
     np.copyto(plane, stored, casting="unsafe")
     return stored.dtype != np.float32 or floats.is_finite(plane)
-
-
-def _reason(error: Exception) -> str:
-    text = str(error).replace('"<python_buffer>"', "").strip()
-    return text.splitlines()[0][:200] if text else type(error).__name__

@@ -26,12 +26,12 @@ _LEVEL = 1  # the higher ones are slower and hardly smaller
 
 # Bytes before compression that a thread encodes at a time: few and large, for between two steps
 # the threads wait for each other; but only a few of them are in memory beside the output.
-_MOST = 2**20
-_LEAST = 2**17
+MAX_STRIP = 2**20
+MIN_STRIP = 2**17
 
-_MOST_NAME = 255  # bytes
+MAX_NAME = 255  # bytes
 _SHORT_NAME = 31
-_MOST_CHUNK = 2**31 - 1
+MAX_CHUNK = 2**31 - 1
 _HALF, _FLOAT = 1, 2  # pixel types
 
 _REQUIRED: dict[str, Any] = {  # unless the caller has others of the same type
@@ -68,7 +68,7 @@ def encode(
     planes = [(name in half, channels[name]) for name in sorted(channels)]
     height, width = planes[0][1].shape
     line_bytes = width * sum(2 if is_half else 4 for is_half, _ in planes)
-    if lines * line_bytes > _MOST_CHUNK:
+    if lines * line_bytes > MAX_CHUNK:
         raise ValueError(f"{lines} scanlines of {line_bytes:,} bytes are too much for a chunk")
     structure = {
         "channels": ("chlist", _channel_list({name: name in half for name in sorted(channels)})),
@@ -80,7 +80,7 @@ def encode(
     }
     header = _header(structure, attributes, channels)
     threads = thread_count()
-    piece = min(_MOST, max(_LEAST, -(-height * line_bytes // threads)))
+    piece = min(MAX_STRIP, max(MIN_STRIP, -(-height * line_bytes // threads)))
     strip = lines * -(-piece // (lines * line_bytes))
     starts = range(0, height, strip)
     encoded: list[list[bytes]] = [[]] * len(starts)
@@ -169,7 +169,7 @@ def _channel_list(channels: Mapping[str, bool]) -> bytes:
 
 def _name(name: str) -> bytes:
     code = name.encode()
-    if not 0 < len(code) <= _MOST_NAME or 0 in code:
+    if not 0 < len(code) <= MAX_NAME or 0 in code:
         raise ValueError(f"no EXR can hold the name {name!r:.60}: 1 to 255 bytes, none of them 0")
     return code + bytes(1)
 

@@ -8,24 +8,27 @@ openexr.com/en/latest/OpenEXRFileLayout.html.
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
 import struct
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
+import OpenEXR
 
 from deepshade.errors import DamagedImageError, ImageError
 from deepshade.exr import chunks as exrchunks
-from deepshade.exr.attributes import MOST_ATTRIBUTES, Buffer, Cursor, RawPart, read_part
+from deepshade.exr.attributes import MAX_ATTRIBUTES, Buffer, Cursor, RawPart, read_part
 from deepshade.exr.chunks import DEEP, LONG_NAMES, MAGIC, MULTIPART, TILED, Chunks, Window
 from deepshade.exr.limits import Limits
 
-__all__ = ["Header", "Limits", "Part", "Window", "parse"]
+LIBRARY_VERSION = tuple(int(number) for number in re.findall(r"\d+", OpenEXR.OPENEXR_VERSION)[:3])
+MIN_HTJ2K_VERSION = (3, 4, 14)  # its decoder had known bugs before
 
 MAX_COORDINATE = 2**30 - 2  # OpenEXR's own bound on windows
-_MAX_TILE = 2**16
+MAX_TILE = 2**16
 _BYTES = {"uint": 4, "half": 2, "float": 4}
 
 # code -> (name, scanlines in one chunk)
@@ -122,8 +125,8 @@ def parse(data: Buffer, limits: Limits) -> Header:
     if flags & DEEP:
         raise _deep()
     multipart = bool(flags & MULTIPART)
-    raws = [read_part(cursor, limits, MOST_ATTRIBUTES)]
-    left = MOST_ATTRIBUTES - len(raws[0].types)
+    raws = [read_part(cursor, limits, MAX_ATTRIBUTES)]
+    left = MAX_ATTRIBUTES - len(raws[0].types)
     while multipart and cursor.peek() != 0:
         limits.check("parts", len(raws) + 1)
         raws.append(read_part(cursor, limits, left))
@@ -176,6 +179,12 @@ def _check_part(raw: RawPart, cursor: Cursor, flags: int, index: int, limits: Li
             f"{where}compression number {code} is unknown here", fix="save it with ZIP compression"
         )
     compression, lines = _COMPRESSIONS[code]
+    if compression.startswith("htj2k") and LIBRARY_VERSION < MIN_HTJ2K_VERSION:
+        raise ImageError(
+            f"{where}{compression} compression can't be read safely by the OpenEXR library here, "
+            f"{'.'.join(map(str, LIBRARY_VERSION))}",
+            fix="save it with ZIP compression, or install OpenEXR 3.4.14 or newer",
+        )
     if tiled:
         if raw.types.get("tiles") != "tiledesc":
             raise DamagedImageError(f"{where}a tiled part without a tile description")
@@ -223,8 +232,7 @@ def _checked_window(raw: RawPart, name: str, where: str) -> Window:
     x0, y0, x1, y1 = raw.attributes[name]
     if x1 < x0 or y1 < y0:
         raise DamagedImageError(f"{where}the {name} is empty: ({x0}, {y0}) to ({x1}, {y1})")
-    # half of it, so that both windows can be moved to the origin together
-    if max(map(abs, (x0, y0, x1, y1))) > MAX_COORDINATE // 2:
+    if max(map(abs, (x0, y0, x1, y1))) > MAX_COORDINATE:
         raise DamagedImageError(f"{where}the {name} is absurd: ({x0}, {y0}) to ({x1}, {y1})")
     return x0, y0, x1, y1
 
@@ -234,26 +242,23 @@ def _tile_count(
 ) -> tuple[int, float]:
     """(number of tiles on all levels, pixels of all levels / of the first)."""
     tile_width, tile_height, mode = tiles
-    if not (1 <= tile_width <= _MAX_TILE and 1 <= tile_height <= _MAX_TILE):
+    if not (1 <= tile_width <= MAX_TILE and 1 <= tile_height <= MAX_TILE):
         raise DamagedImageError(f"{where}absurd tiles of {tile_width} x {tile_height} pixels")
     levels, rounding = mode & 0xF, mode >> 4
     if levels > 2 or rounding > 1:
         raise DamagedImageError(f"{where}unknown tile mode {mode}")
 
-    def sizes(size: int, count: int) -> list[int]:
-        up = (1 << np.arange(count, dtype=np.int64)) - 1 if rounding else 0
-        return [max(1, int(s)) for s in (size + up) >> np.arange(count)]
+    def sizes(size: int) -> list[int]:  # of each level, until 1 pixel is left
+        found = [size]
+        while found[-1] > 1:
+            found.append((found[-1] + rounding) // 2)
+        return found
 
-    def depth(size: int) -> int:  # levels until 1 pixel is left
-        return (math.ceil if rounding else math.floor)(math.log2(size)) + 1
-
+    pairs: list[tuple[int, ...]] = [(width, height)]
     if levels == 1:
-        count = depth(max(width, height))
-        pairs = list(zip(sizes(width, count), sizes(height, count), strict=True))
+        pairs = list(itertools.zip_longest(sizes(width), sizes(height), fillvalue=1))
     elif levels == 2:
-        pairs = [(w, h) for h in sizes(height, depth(height)) for w in sizes(width, depth(width))]
-    else:
-        pairs = [(width, height)]
+        pairs = list(itertools.product(sizes(width), sizes(height)))
     chunks = sum(-(-w // tile_width) * -(-h // tile_height) for w, h in pairs)
     scale = sum(w * h for w, h in pairs) / (width * height)
     return chunks, scale

@@ -1,4 +1,4 @@
-"""Reads and writes OpenEXR images; nothing outside this and `exrdecode` knows the library."""
+"""Reads and writes OpenEXR images; nothing outside this and `decode` knows the library."""
 
 from __future__ import annotations
 
@@ -16,35 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 from deepshade import floats
 from deepshade.errors import ImageError
 from deepshade.exr import encode as exrencode
+from deepshade.exr.chunks import Window
 from deepshade.exr.decode import Wanted, decode
-from deepshade.exr.header import MAX_COORDINATE, Header, Limits, Part, Window, parse
+from deepshade.exr.header import MAX_COORDINATE, Header, parse
+from deepshade.exr.limits import Limits
 from deepshade.files import replacing
 from deepshade.threads import thread_count
 
-__all__ = [
-    "COMPRESSIONS",
-    "Header",
-    "Image",
-    "Limits",
-    "Part",
-    "Window",
-    "fetch",
-    "read",
-    "read_header",
-    "write",
-]
-
 Pixels = NDArray[np.float32]
 
+_NAMES = ("none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256")
 COMPRESSIONS = {
-    name.removesuffix("_COMPRESSION").lower().replace("no", "none"): member
-    for name, member in OpenEXR.Compression.__members__.items()
-    if name.removesuffix("_COMPRESSION")
-    in ("NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
+    name: getattr(OpenEXR, f"{name.replace('none', 'no').upper()}_COMPRESSION") for name in _NAMES
 }
 
-_THREADED = {"piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256", "htj2k32"}
-_pool_owner = 0
+_pool_owner = 0  # the process that started the library's threads
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,18 +47,13 @@ class Image:
     def stack(self, names: Sequence[str]) -> Pixels:
         """Channels as one (C, H, W) array; no copy when they were read in this order."""
         planes = [self.pixels[name] for name in names]
-        block = planes[0].base
-        if (
-            isinstance(block, np.ndarray)
-            and block.ndim == 3
-            and block.dtype == np.float32
-            and all(plane.base is block for plane in planes)
-        ):
-            starts = [plane.ctypes.data - block.ctypes.data for plane in planes]
-            step = planes[0].nbytes
-            index = starts[0] // step if step else 0
-            if starts == [(index + k) * step for k in range(len(planes))]:
-                return block[index : index + len(planes)]
+        block = planes[0].base  # (n, H, W): all planes of this size, in the order of reading
+        if block is None or block.shape[1:] != planes[0].shape:
+            return np.stack(planes)
+        start, size = block.ctypes.data, planes[0].nbytes
+        at = [(plane.ctypes.data - start) // size for plane in planes]
+        if all(plane.base is block for plane in planes) and np.all(np.diff(at) == 1):
+            return block[at[0] : at[0] + len(at)]
         return np.stack(planes)
 
 
@@ -132,15 +113,15 @@ def write(
     attributes: Mapping[str, Any] | None = None,
     compression: str = "zip",
     half: bool | Collection[str] = False,
-    frame: tuple[int, int] | None = None,
-    origin: tuple[int, int] = (0, 0),
+    data_window: Window | None = None,
+    display_window: Window | None = None,
 ) -> None:
     """Writes a single-part scanline EXR.
 
     `channels` maps names to (H, W) arrays, all of one size. `half` says which of them are
     stored in 16 bits: all, none, or those named; finite values beyond ±65504 are clamped there
-    rather than turned into infinities. `frame` is the display window's (width, height), the
-    image's own size by default; `origin` is where its first pixel lies in that frame.
+    rather than turned into infinities. Windows are (x0, y0, x1, y1), inclusive: where the pixels
+    lie, and the whole frame; each begins at (0, 0) and has the image's size by default.
     `attributes` are numbers, strings, 2- or 3-vectors, 3x3 or 4x4 matrices; an integer beyond
     32 bits is stored as text. A path is replaced atomically: written beside, synced, renamed.
     Raises ValueError for arrays or settings that no EXR can hold.
@@ -155,24 +136,25 @@ def write(
         raise ValueError(f"channels differ in size: {sorted(shapes)}")
     height, width = shapes.pop()
     halves = {name for name in planes if (half if isinstance(half, bool) else name in half)}
-    data_window = _window("data", *origin, width, height)
-    display_window = _window("display", 0, 0, *(frame or (width, height)))
+    data = _checked_window("data", data_window or (0, 0, width - 1, height - 1))
+    display = _checked_window("display", display_window or (0, 0, width - 1, height - 1))
+    if (data[3] - data[1] + 1, data[2] - data[0] + 1) != (height, width):
+        raise ValueError(f"an image of {width} x {height} pixels can't fill the data window {data}")
     header = {key: _attribute(key, value) for key, value in (attributes or {}).items()}
 
     def encode(stream: BinaryIO) -> None:
         if compression in exrencode.COMPRESSIONS:
-            windows = data_window, display_window
-            for piece in exrencode.encode(planes, halves, *windows, compression, header):
+            for piece in exrencode.encode(planes, halves, data, display, compression, header):
                 stream.write(piece)
             return
         stored = {name: _encodable(plane, name in halves) for name, plane in planes.items()}
         settings = header | {
             "compression": COMPRESSIONS[compression],
             "type": OpenEXR.scanlineimage,
-            "dataWindow": _corners(data_window),
-            "displayWindow": _corners(display_window),
+            "dataWindow": _corners(data),
+            "displayWindow": _corners(display),
         }
-        with OpenEXR.File(settings, stored, num_threads=_threads(compression)) as file:
+        with OpenEXR.File(settings, stored, num_threads=_library_threads()) as file:
             file.write(stream)
 
     if isinstance(target, (str, os.PathLike)):
@@ -236,28 +218,24 @@ def _attribute(key: str, value: Any) -> Any:
     raise ValueError(f"the header attribute '{key}' can't hold {value!r:.60}")
 
 
-def _window(name: str, x0: int, y0: int, width: int, height: int) -> Window:
-    window = int(x0), int(y0), int(x0 + width - 1), int(y0 + height - 1)
-    if width < 1 or height < 1 or max(map(abs, window)) > MAX_COORDINATE:
+def _checked_window(name: str, window: Window) -> Window:
+    x0, y0, x1, y1 = map(int, window)
+    if x1 < x0 or y1 < y0 or max(map(abs, (x0, y0, x1, y1))) > MAX_COORDINATE:
         raise ValueError(f"no EXR can hold the {name} window {window} (x0, y0, x1, y1)")
-    return window
+    return x0, y0, x1, y1
 
 
 def _corners(window: Window) -> tuple[Any, Any]:
     return np.array(window[:2], np.int32), np.array(window[2:], np.int32)
 
 
-def _threads(compression: str) -> int:
+def _library_threads() -> int:
     """How many threads the library may use to write a file; starts its pool on first use.
 
-    Only compressions that pack many scanlines into a chunk gain; with one scanline a chunk,
-    handing over costs more than encoding. The pool is empty by default, which means serial. A
-    forked child inherits its size but none of its threads, and would wait for them forever: there
-    it is 0.
+    The pool is empty by default, which means serial. A forked child inherits its size but none of
+    its threads, and would wait for them forever: there it is 0.
     """
     global _pool_owner
-    if compression not in _THREADED or thread_count() == 1:
-        return 0
     if _pool_owner == 0:
         OpenEXR.set_global_thread_count(thread_count())
         _pool_owner = os.getpid()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
-from deepshade.camera import Camera
+from deepshade.camera import Camera, placement_of
 from deepshade.errors import CameraError, ConfigError, ImageError
 from deepshade.exr import Header, Limits
 from deepshade.gbuffer import background, channels, derivation
@@ -33,7 +33,8 @@ class GBuffer:
     background and doesn't count). `mapped` tells which channels each quantity came from,
     `decoded` all that were read for that, as (file, channel), and `derived` how the others were
     computed. The windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes
-    came from.
+    came from, `part_header` its own attributes; `header` holds those of all parts and files, the
+    first of each name.
     """
 
     attributes: dict[str, NDArray[np.float32]]
@@ -44,6 +45,7 @@ class GBuffer:
     decoded: tuple[tuple[int, str], ...] = ()
     derived: dict[str, str] = field(default_factory=dict)
     header: dict[str, Any] = field(default_factory=dict)
+    part_header: dict[str, Any] = field(default_factory=dict)
     data_window: exr.Window = (0, 0, 0, 0)
     display_window: exr.Window = (0, 0, 0, 0)
 
@@ -51,6 +53,14 @@ class GBuffer:
     def shape(self) -> tuple[int, int]:
         """(height, width)."""
         return cast(tuple[int, int], self.background.shape)
+
+    def placement(self) -> dict[str, Any]:
+        """EXR attributes that, beside the windows, put an answer exactly where its input lies.
+
+        Pixel aspect, screen window and worldToCamera: the camera's, or without one (no field of
+        view is known) what the part's header says of them, as far as it is usable.
+        """
+        return placement_of(self.part_header) | (self.camera.to_header() if self.camera else {})
 
 
 def load_gbuffer(
@@ -108,6 +118,7 @@ def load_gbuffer(
         decoded=tuple((c.file, name) for c in choices.values() for name in c.channels),
         derived={name: planned.how(step) for name, step in steps.items()},
         header=planned.attributes,
+        part_header=part.attributes,
         data_window=part.data_window,
         display_window=part.display_window,
     )

@@ -55,6 +55,7 @@ def parse_procedural(name: str) -> tuple[str, int | None]:
 def load_mesh(path: Path) -> Mesh:
     """Read every mesh of a file, with its node transforms and materials, into one.
 
+    Each node of the scene graph that holds triangles is an object.
     Normals of the file are kept; where there are none, edges sharper than 40° stay sharp.
     """
     import trimesh
@@ -68,16 +69,17 @@ def load_mesh(path: Path) -> Mesh:
         )
     try:
         loaded = trimesh.load_scene(path, process=False)
-        meshes = [mesh for node in loaded.graph.nodes_geometry for mesh in _placed(loaded, node)]
+        nodes = loaded.graph.nodes_geometry
+        meshes = {node: mesh for node in nodes if (mesh := _placed(loaded, node)) is not None}
     except Exception as error:  # trimesh raises whatever its many parsers do
         raise SceneError(f"{path} can't be read: {error}") from error
-    if not any(len(mesh.faces) for mesh in meshes):
+    if not any(len(mesh.faces) for mesh in meshes.values()):
         raise SceneError(f"{path} holds no triangles")
-    return merge(meshes)
+    return merge(meshes.values(), list(meshes))
 
 
-def _placed(scene: Any, node: str) -> list[Mesh]:
-    """The mesh of a scene graph's node, if it has one, where its transforms put it.
+def _placed(scene: Any, node: str) -> Mesh | None:
+    """The mesh of a scene graph's node where its transforms put it; None if it has none.
 
     trimesh can do this itself (`dump`), but then forgets the normals that the file brought.
     """
@@ -86,10 +88,10 @@ def _placed(scene: Any, node: str) -> list[Mesh]:
     matrix, name = scene.graph[node]
     part = scene.geometry[name]
     if not isinstance(part, trimesh.Trimesh) or not len(part.faces):
-        return []
+        return None
     if abs(np.linalg.det(matrix[:3, :3])) == 0:
-        return []  # squashed flat: some exporters hide things so
-    return [_convert(part).transformed(np.asarray(matrix, np.float64))]
+        return None  # squashed flat: some exporters hide things so
+    return _convert(part).transformed(np.asarray(matrix, np.float64))
 
 
 def _convert(part: Any) -> Mesh:

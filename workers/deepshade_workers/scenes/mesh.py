@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,18 +27,28 @@ class Material:
         return np.array([*self.diffuse, *self.specular, self.gloss, *self.scatter])
 
 
+class Object(NamedTuple):
+    """A part of a mesh that moves as one: its faces are `start` to `stop` - 1."""
+
+    name: str
+    start: int
+    stop: int
+
+
 @dataclass(frozen=True)
 class Mesh:
     """Triangles with a normal per corner.
 
     `vertices` (V, 3), `faces` (F, 3) indices, `normals` (F, 3, 3) one unit normal per corner,
-    `materials` (F, 10) rows of `Material.row`. Counter-clockwise faces look outward.
+    `materials` (F, 10) rows of `Material.row`. Counter-clockwise faces look outward. `objects`
+    follow each other and hold all faces; none where the mesh is part of an object.
     """
 
     vertices: Floats
     faces: Ints
     normals: Floats
     materials: Floats = field(repr=False)
+    objects: tuple[Object, ...] = ()
 
     @classmethod
     def build(
@@ -77,28 +88,40 @@ class Mesh:
         """Apply a (4, 4) affine `matrix`; normals follow the inverse transpose."""
         linear = matrix[:3, :3]
         vertices = self.vertices @ linear.T + matrix[:3, 3]
-        mirrored = np.linalg.det(linear) < 0
         normals = self.normals @ np.linalg.inv(linear)
         normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-30)
-        if mirrored:
-            return Mesh(vertices, self.faces[:, ::-1], normals[:, ::-1], self.materials)
-        return Mesh(vertices, self.faces, normals, self.materials)
+        moved = replace(self, vertices=vertices, normals=normals)
+        return moved.flipped() if np.linalg.det(linear) < 0 else moved
+
+    def flipped(self) -> Mesh:
+        """The same triangles with their corners in the other order, and so facing the other way."""
+        return replace(self, faces=self.faces[:, ::-1], normals=self.normals[:, ::-1])
 
     def with_material(self, material: Material) -> Mesh:
         """The same triangles made of one `material`."""
-        rows = np.tile(material.row(), (len(self.faces), 1))
-        return Mesh(self.vertices, self.faces, self.normals, rows)
+        return replace(self, materials=np.tile(material.row(), (len(self.faces), 1)))
 
 
-def merge(meshes: Iterable[Mesh]) -> Mesh:
-    """Join meshes into one, so that a ray tracer sees a single shape."""
+def merge(meshes: Iterable[Mesh], names: Sequence[str] = ()) -> Mesh:
+    """One mesh of all, so that a ray tracer sees a single shape.
+
+    `names`, one for each mesh, say which objects they belong to: neighbours of equal name are one.
+    """
     parts = list(meshes)
+    ends = np.cumsum([len(part.faces) for part in parts])
+    objects: list[Object] = []
+    for name, part, end in zip(names, parts, ends.tolist(), strict=bool(names)):
+        start = end - len(part.faces)
+        if objects and objects[-1].name == name:
+            start = objects.pop().start
+        objects.append(Object(name, start, end))
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)]),
         np.concatenate([part.normals for part in parts]),
         np.concatenate([part.materials for part in parts]),
+        tuple(objects),
     )
 
 

@@ -1,16 +1,18 @@
-"""A scene ready for ray tracing, and how to open one by name."""
+"""A scene ready for ray tracing, and its objects."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deepshade.errors import SceneError
+from deepshade.errors import SceneError, nearest
 from deepshade_workers.backend import mitsuba
-from deepshade_workers.scenes.mesh import Floats, Mesh
+from deepshade_workers.scenes.mesh import Floats, Mesh, Object
+from deepshade_workers.view import Vector
 
 # A distant sun and a dim sky: what lights a scene that brings no lights of its own.
 SUN_DIRECTION = (-0.45, -0.75, -0.5)
@@ -24,7 +26,9 @@ MATERIAL_CHANNELS = {"diffuse": (0, 3), "specular": (3, 6), "gloss": (6, 7), "sc
 class Scene:
     """A Mitsuba scene with its name and bounds (2, 3) in scene units.
 
-    `lit` tells whether the scene brings lights of its own.
+    `lit` tells whether the scene brings lights of its own. `objects` are what may move, with their
+    faces in the one mesh that is traced; its face attribute "object" holds an object's number at a
+    hit. A Mitsuba XML scene tells none.
     `points` (n, 3) are places worth looking at, `extent` the size of the region they cover:
     a town on a wide plain is as large as the town.
     """
@@ -35,11 +39,29 @@ class Scene:
     points: Floats
     extent: float
     lit: bool = False
+    objects: tuple[Object, ...] = ()
 
     @property
     def diagonal(self) -> float:
         """Length of the bounding box's diagonal, scene units."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
+
+    def displacements(self, by_name: Mapping[str, Vector]) -> Floats:
+        """(objects, 3): how far each object moves, 0 for those that `by_name` doesn't hold.
+
+        Raises:
+            SceneError: no object has one of the names.
+        """
+        names = [item.name for item in self.objects]
+        for name in by_name:
+            if name not in names:
+                near = nearest(name, names)
+                hint = f"did you mean {near!r}? " if near else ""
+                raise SceneError(
+                    f"scene {self.name!r} has no object {name!r}",
+                    fix=f"{hint}it has {', '.join(names[:8]) or 'none that can move'}",
+                )
+        return np.array([by_name.get(name, (0, 0, 0)) for name in names], np.float64)
 
     @classmethod
     def from_mesh(cls, name: str, mesh: Mesh) -> Scene:
@@ -61,7 +83,8 @@ class Scene:
         traced = mi.load_dict({"type": "scene", "mesh": shape, **lights})
         # Where the triangles are small there is something to see; large ones are floors.
         points = mesh.vertices[mesh.faces[:: max(1, len(mesh.faces) // 4096)]].mean(1)
-        return cls(name, traced, bounds, points, _spread(points))
+        objects = mesh.objects or (Object(name, 0, len(mesh.faces)),)
+        return cls(name, traced, bounds, points, _spread(points), objects=objects)
 
     @classmethod
     def from_xml(cls, path: Path) -> Scene:
@@ -96,6 +119,10 @@ def _shape(mi: Any, name: str, mesh: Mesh) -> Any:
     for channel, (start, stop) in MATERIAL_CHANNELS.items():
         values = np.ascontiguousarray(mesh.materials[:, start:stop], np.float32)
         shape.add_attribute(f"face_{channel}", stop - start, values.ravel())
+    # Numbers up to 2^24 are exact in float32.
+    faces = [item.stop - item.start for item in mesh.objects] or [count]
+    numbers = np.repeat(np.arange(len(faces), dtype=np.float32), faces)
+    shape.add_attribute("face_object", 1, numbers)
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(corners.ravel())
     params["vertex_normals"] = mi.Float(mesh.normals.astype(np.float32).ravel())

@@ -19,10 +19,10 @@ from deepshade.errors import DataError, SceneError
 from deepshade_report.baselines.ao.oidn import Denoiser
 from deepshade_report.method import Float, Method, View
 from deepshade_workers.backend import mitsuba
-from deepshade_workers.references.ao import offset_origin, pixel_streams, random_pair, strata
+from deepshade_workers.sampling import pixel_streams, random_pair, strata
 from deepshade_workers.scenes.loading import PROCEDURAL, open_scene
 from deepshade_workers.scenes.scene import Scene
-from deepshade_workers.trace import Hits, trace
+from deepshade_workers.trace import Hits, offset_origin, trace
 
 mi = mitsuba()
 

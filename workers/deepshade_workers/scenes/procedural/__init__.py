@@ -10,25 +10,14 @@ import numpy as np
 from deepshade_workers.scenes.mesh import Mesh
 from deepshade_workers.scenes.procedural import exteriors, interiors, nature
 
+_IN = (interiors.room, interiors.furniture, interiors.stairs, interiors.level)
+_OUT = (exteriors.colonnade, exteriors.town, exteriors.fences, exteriors.pipes, exteriors.machines)
+_GROWN = (nature.foliage, nature.rubble, nature.terrain, nature.cave, nature.blobs)
+_LOOSE = (nature.scattered, nature.figures, nature.drapery, nature.crockery)
+
+# Their order is that in which a data set takes them in turn.
 FAMILIES: dict[str, Callable[[np.random.Generator], Mesh]] = {
-    "room": interiors.room,
-    "furniture": interiors.furniture,
-    "stairs": interiors.stairs,
-    "level": interiors.level,
-    "colonnade": exteriors.colonnade,
-    "town": exteriors.town,
-    "fences": exteriors.fences,
-    "pipes": exteriors.pipes,
-    "machines": exteriors.machines,
-    "foliage": nature.foliage,
-    "rubble": nature.rubble,
-    "terrain": nature.terrain,
-    "cave": nature.cave,
-    "blobs": nature.blobs,
-    "scattered": nature.scattered,
-    "figures": nature.figures,
-    "drapery": nature.drapery,
-    "crockery": nature.crockery,
+    family.__name__: family for family in (*_IN, *_OUT, *_GROWN, *_LOOSE)
 }
 
 

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+
 from deepshade_workers.scenes.mesh import Floats, Material, Mesh, merge
 from deepshade_workers.scenes.procedural.primitives import Rng, along, box, cylinder, place, sphere
 
+Size = tuple[float, float, float]
+
+# How many materials scatter light below their surface, and how far it gets (scene units).
+SCATTERING_SHARE = 0.4
+MEAN_FREE_PATHS = (0.005, 0.3)
+
 
 class Assembly:
-    """A growing list of placed meshes with random materials, drawn from `rng`."""
+    """A growing list of placed meshes with random materials, drawn from `rng`.
+
+    What is placed between two coats of paint is one object.
+    """
 
     def __init__(self, rng: Rng) -> None:
         self.rng = rng
+        # A stream of its own: a seed's geometry and other materials don't depend on it.
+        self._scatter_rng = rng.spawn(1)[0]
         self._parts: list[Mesh] = []
-        self.material = self._draw_material()
+        self._names: list[str] = []
+        self._coats = 0
+        self.paint()
 
     def _draw_material(self) -> Material:
         rng = self.rng
@@ -20,31 +37,40 @@ class Assembly:
         shine = rng.uniform(0, 0.3)
         gloss = float(2 ** rng.uniform(1, 8))
         r, g, b = (float(v) for v in diffuse)
-        return Material((r, g, b), (shine, shine, shine), gloss)
+        return Material((r, g, b), (shine, shine, shine), gloss, self._draw_scatter())
+
+    def _draw_scatter(self) -> tuple[float, float, float]:
+        rng = self._scatter_rng
+        scatters = rng.random() < SCATTERING_SHARE
+        farthest = np.exp(rng.uniform(*np.log(MEAN_FREE_PATHS)))
+        r, g, b = (float(v) for v in scatters * farthest * rng.uniform(0.2, 1, 3))
+        return r, g, b
 
     def paint(self) -> None:
-        """Give what follows a new material."""
+        """Begin a new object, of a new material."""
         self.material = self._draw_material()
+        self._coats += 1
 
     def add(self, mesh: Mesh, matrix: Floats | None = None) -> None:
         """Place `mesh` by a (4, 4) `matrix`."""
         placed = mesh if matrix is None else mesh.transformed(matrix)
         self._parts.append(placed.with_material(self.material))
+        self._names.append(f"object {self._coats}")
 
     def box(
-        self,
-        center: tuple[float, float, float] | Floats,
-        size: tuple[float, float, float] | Floats,
-        rotation: Floats | None = None,
+        self, center: Size | Floats, size: Size | Floats, rotation: Floats | None = None
     ) -> None:
         """Place a box by its centre and full size."""
         self.add(box(), place(center, size, rotation))
 
+    def boxes_at(self, at: Floats, turn: Floats) -> Callable[[Size, Size], None]:
+        """A function that places a box by its offset from `at` and its size, turned by `turn`."""
+        return lambda offset, size: self.box(at + turn @ np.array(offset), size, turn)
+
     def span(self, low: tuple[float, ...], high: tuple[float, ...]) -> None:
         """Place a box from its lowest to its highest corner."""
-        center = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-        size = [abs(b - a) for a, b in zip(low, high, strict=True)]
-        self.add(box(), place((center[0], center[1], center[2]), (size[0], size[1], size[2])))
+        a, b = np.array(low, np.float64), np.array(high, np.float64)
+        self.box((a + b) / 2, abs(b - a))
 
     def bar(self, start: Floats, end: Floats, thickness: float, sides: int = 12) -> None:
         """Place a round bar between two points."""
@@ -60,4 +86,4 @@ class Assembly:
 
     def finish(self) -> Mesh:
         """All parts as one mesh."""
-        return merge(self._parts)
+        return merge(self._parts, self._names)

@@ -32,22 +32,9 @@ def colonnade(rng: Rng) -> Mesh:
         )
     base = 0.6
     a.floor(30)
-    profile = np.array(
-        [
-            [0, 0],
-            [0.6, 0],
-            [0.6, 0.04],
-            [0.5, 0.07],
-            [0.45, 0.1],
-            [0.42, 0.5],
-            [0.38, 0.9],
-            [0.5, 0.94],
-            [0.6, 0.96],
-            [0.6, 1],
-            [0, 1],
-        ]
-    )
-    column = lathe(profile, int(rng.choice([6, 8, 16, 32])))
+    radius = [0, 0.6, 0.6, 0.5, 0.45, 0.42, 0.38, 0.5, 0.6, 0.6, 0]
+    height = [0, 0, 0.04, 0.07, 0.1, 0.5, 0.9, 0.94, 0.96, 1, 1]
+    column = lathe(np.stack([radius, height], 1), int(rng.choice([6, 8, 16, 32])))
     rows = int(rng.integers(1, 4))
     for row in range(rows):
         for i in range(count + 1):
@@ -211,14 +198,8 @@ def machines(rng: Rng) -> Mesh:
                 a.box(center, size, turn)
                 for _ in range(int(rng.integers(0, 4))):
                     small = size * rng.uniform(0.15, 0.6, 3)
-                    offset = np.array(
-                        [
-                            rng.uniform(-0.3, 0.3) * size[0],
-                            size[1] / 2,
-                            rng.uniform(-0.3, 0.3) * size[2],
-                        ]
-                    )
-                    a.box(center + turn @ offset, small, turn)
+                    offset = np.array([rng.uniform(-0.3, 0.3), 0.5, rng.uniform(-0.3, 0.3)])
+                    a.box(center + turn @ (offset * size), small, turn)
             elif kind < 0.85:
                 size[2] = size[0]
                 a.add(cylinder(int(rng.choice([6, 24]))), place(center, size, turn))

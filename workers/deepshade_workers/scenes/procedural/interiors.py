@@ -57,10 +57,7 @@ def table(a: Assembly, at: Floats, angle: float, width: float, depth: float, hig
     """A table: a top on four legs, perhaps with aprons."""
     rng, turn = a.rng, turn_y(angle)
     thick, leg = rng.uniform(0.03, 0.08), rng.uniform(0.05, 0.1)
-
-    def part(offset: tuple[float, float, float], size: tuple[float, float, float]) -> None:
-        a.box(at + turn @ np.array(offset), size, turn)
-
+    part = a.boxes_at(at, turn)
     part((0, high - thick / 2, 0), (width, thick, depth))
     for sx in (-1, 1):
         for sz in (-1, 1):
@@ -89,10 +86,7 @@ def shelf(a: Assembly, at: Floats, angle: float, width: float, high: float) -> N
     """A case of shelves, partly filled with books and odd things."""
     rng, turn, depth = a.rng, turn_y(angle), a.rng.uniform(0.25, 0.45)
     wall = 0.04
-
-    def part(offset: tuple[float, float, float], size: tuple[float, float, float]) -> None:
-        a.box(at + turn @ np.array(offset), size, turn)
-
+    part = a.boxes_at(at, turn)
     for sx in (-1, 1):
         part((sx * (width - wall) / 2, high / 2, 0), (wall, high, depth))
     part((0, high / 2, -depth / 2), (width, high, wall / 2))
@@ -115,10 +109,7 @@ def shelf(a: Assembly, at: Floats, angle: float, width: float, high: float) -> N
 def sofa(a: Assembly, at: Floats, angle: float, width: float) -> None:
     """A sofa: a seat with cushions, a back and two arms."""
     rng, turn = a.rng, turn_y(angle)
-
-    def part(offset: tuple[float, float, float], size: tuple[float, float, float]) -> None:
-        a.box(at + turn @ np.array(offset), size, turn)
-
+    part = a.boxes_at(at, turn)
     part((0, 0.25, 0), (width, 0.3, 0.85))
     part((0, 0.6, -0.36), (width, 0.6, 0.18))
     for sx in (-1, 1):

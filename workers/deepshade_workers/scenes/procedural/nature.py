@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from deepshade_workers.scenes.mesh import Floats, Mesh
@@ -149,9 +151,7 @@ def cave(rng: Rng) -> Mesh:
     """The inside of a rough hollow, with boulders and stalagmites."""
     a = Assembly(rng)
     hollow = blob(rng, rng.uniform(0.3, 0.7), detail=5, creased=rng.random() < 0.4)
-    inside = Mesh(
-        hollow.vertices, hollow.faces[:, ::-1], -hollow.normals[:, ::-1], hollow.materials
-    )
+    inside = replace(hollow.flipped(), normals=-hollow.normals[:, ::-1])
     a.add(inside, place(size=(9, 6, 9)))
     for _ in range(int(rng.integers(20, 60))):
         a.paint()

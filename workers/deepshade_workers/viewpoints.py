@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 
 from deepshade.camera import Camera
 from deepshade.errors import SceneError
-from deepshade_workers.references.ao import ambient_occlusion
+from deepshade_workers.references import ao
 from deepshade_workers.scenes.mesh import Floats
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, trace
+from deepshade_workers.view import Vector, View
 
 FOV = 50.0
 PROBE = 48
@@ -20,14 +21,6 @@ MAX_BACKGROUND = 0.6
 MAX_BACK_FACES = 0.05
 # Effect radius relative to the view's median depth: about 25 to 280 pixels of a 512-pixel frame.
 RADIUS_RANGE = (0.05, 0.5)
-
-
-@dataclass(frozen=True)
-class View:
-    """A camera and the effect radius that suits what it sees, both in scene units."""
-
-    camera: Camera
-    radius: float
 
 
 def sample_view(
@@ -39,13 +32,14 @@ def sample_view(
     fov: float = FOV,
     radius: float | None = None,
     min_contrast: float = 0.06,
+    displacements: Mapping[str, Vector] | None = None,
 ) -> View:
     """A random view: `size`² pixels out of a `frame`² one, at a random place of it.
 
     Refused are views from inside geometry (back faces show), of mostly background, from so near
     that one surface fills the view, and those whose ambient occlusion varies by less than
     `min_contrast` (standard deviation), such as a bare wall. `radius` is drawn log-uniformly in
-    `RADIUS_RANGE` times the median depth unless given.
+    `RADIUS_RANGE` times the median depth unless given. `displacements` become the view's.
 
     Raises:
         SceneError: no such view turned up in `MAX_TRIES` tries.
@@ -62,9 +56,10 @@ def sample_view(
         if depth is None:
             continue
         reach = factor * depth if radius is None else radius
-        visibility, _ = ambient_occlusion(scene, hits, radius=reach, samples=32, seed=seed)
+        view = View(camera, reach, displacements=displacements or {})
+        visibility, _ = ao.reference(scene, view, hits, {}, samples=32, seed=seed)
         if float(visibility.std()) >= min_contrast:
-            return View(camera, reach)
+            return view
     raise SceneError(
         f"no useful view of {scene.name} in {MAX_TRIES} tries",
         fix="check that its faces look outward and that its size suits --radius",

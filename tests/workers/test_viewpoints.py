@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from deepshade.errors import SceneError
-from deepshade_workers.references.ao import ambient_occlusion
+from deepshade_workers.references import ao
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import trace
-from deepshade_workers.views import RADIUS_RANGE, sample_view
+from deepshade_workers.viewpoints import RADIUS_RANGE, sample_view
 
 from .conftest import quad
 
@@ -25,7 +25,7 @@ def test_views_show_something_from_outside(name: str) -> None:
         valid = hits.valid.numpy()
         assert valid.mean() > 0.35
         assert hits.back.numpy()[valid].mean() < 0.1
-        value, _ = ambient_occlusion(scene, hits, radius=view.radius, samples=32, seed=1)
+        value, _ = ao.reference(scene, view, hits, {}, samples=32, seed=1)
         assert value.std() > 0.06
         depth = float(np.median(hits.depth.numpy()[valid]))
         low, high = RADIUS_RANGE

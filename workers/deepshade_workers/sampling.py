@@ -1,0 +1,56 @@
+"""Random numbers of references: a hashed stream for each pixel, and strata.
+
+Every pixel and sample draws from its own stream: a Tiny Encryption Algorithm hash of (pixel,
+view seed) keys a second hash of the sample's index (Zafar, Olano and Curtis, "GPU Random Numbers
+via the Tiny Encryption Algorithm", HPG 2010), so neighbours share no pattern.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import drjit as dr
+
+from deepshade_workers.backend import mitsuba
+
+mi = mitsuba()
+
+
+def random_pair(stream: Any, index: Any) -> Any:
+    """Two floats in [0, 1) for sample `index` of each pixel's `stream`."""
+    a, b = mi.sample_tea_32(stream, index, 6)
+    scale = 2.0**-24
+    return mi.Point2f(mi.Float(a >> 8) * scale, mi.Float(b >> 8) * scale)
+
+
+def pixel_streams(count: int, seed: int) -> Any:
+    """One hashed 32-bit stream key per pixel, from the view's seed.
+
+    Two estimates of one view whose errors shall be independent need seeds that differ: `seed` ^ a
+    constant of their own.
+    """
+    low, high = seed & 0xFFFFFFFF, (seed >> 32) & 0xFFFFFFFF
+    index = dr.arange(mi.UInt32, count)
+    key, _ = mi.sample_tea_32(index ^ dr.opaque(mi.UInt32, high), dr.opaque(mi.UInt32, low), 6)
+    return key
+
+
+def strata(samples: int) -> tuple[int, int]:
+    """Columns and rows of the grid whose cells hold two of about `samples` each.
+
+    Exactly `samples` where that number factors into a grid no longer than 4:1, else a few less
+    in a square one: strata in one dimension alone would double the error.
+    """
+    cells = max(1, samples // 2)
+    side = math.isqrt(cells)
+    for rows in range(side, 0, -1):
+        if cells % rows == 0 and cells // rows <= 4 * rows:
+            return cells // rows, rows
+    return cells // side, side
+
+
+def rays_used(samples: int) -> int:
+    """How many rays a pixel a reference with `samples` asked for really takes."""
+    columns, rows = strata(samples)
+    return 2 * columns * rows

@@ -1,0 +1,44 @@
+"""A view of a scene, and the images that are made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepshade.camera import Camera
+from deepshade.effects import SETTINGS
+
+Vector = tuple[float, float, float]
+Image = NDArray[np.float32]  # planar: (C, H, W)
+Images = dict[str, Image]
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera with the settings of what is seen through it; None where they aren't set.
+
+    `radius`, `focus` (distance) and `aperture` (diameter) are in scene units, `shutter` in frames,
+    `environment` is a map's name. `displacements` says by name how far objects of the scene move
+    while the shutter is open, (x, y, z) in world space; the picture is of the middle of that time.
+    """
+
+    camera: Camera
+    radius: float
+    focus: float | None = None
+    aperture: float | None = None
+    shutter: float | None = None
+    environment: str | None = None
+    displacements: Mapping[str, Vector] = field(default_factory=dict)
+
+    def settings(self) -> dict[str, float | str]:
+        """The settings that are set, by their names in `deepshade.effects.SETTINGS`."""
+        return {name: value for name in SETTINGS if (value := getattr(self, name)) is not None}
+
+    def header(self) -> dict[str, Any]:
+        """The EXR attributes of the camera and the settings."""
+        settings = {SETTINGS[name].header: value for name, value in self.settings().items()}
+        return {**self.camera.to_header(), **settings}
