@@ -39,12 +39,8 @@ class Service:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.models = Models(
-            settings.models,
-            threads=settings.threads,
-            engine=settings.engine,
-            precision=settings.precision,
-        )
+        pinned = settings.engine, settings.precision
+        self.models = Models(settings.models, threads=settings.threads, pinned=pinned)
         self.workers = Workers(settings.workers, settings.queue)
         self.uploads = Uploads(settings)
         self.memory = MemoryBudget(settings.memory)

@@ -73,7 +73,8 @@ def serve(
 
     from deepshade.bundles import bundle_root
     from deepshade.errors import ConfigError
-    from deepshade_service.config import Settings, default_limits
+    from deepshade.machine import cpu_count
+    from deepshade_service.config import Settings, default_limits, default_memory
     from deepshade_service.memory import parse_size
     from deepshade_service.models import check_backend
 
@@ -84,30 +85,27 @@ def serve(
         )
     if engine or precision:
         check_backend(engine, precision)  # said now, and not by every answer
-    limits = {
-        "body_bytes": parse_size(max_body) if max_body else None,
-        "decoded_bytes": parse_size(max_decoded) if max_decoded else None,
+    given = {
+        "body_bytes": max_body and parse_size(max_body),
+        "decoded_bytes": max_decoded and parse_size(max_decoded),
         "pixels": max_pixels,
         "parts": max_parts,
         "channels": max_channels,
     }
     uploads = parse_size(max_uploads) if max_uploads else 0
-    chosen = {"threads": threads, "memory": parse_size(memory) if memory else None}
     settings = Settings(
         models=models,
         engine=engine,
         precision=precision,
-        limits=replace(
-            default_limits(uploads),
-            **{name: value for name, value in limits.items() if value is not None},
-        ),
+        limits=replace(default_limits(uploads), **{k: v for k, v in given.items() if v}),
+        threads=threads or cpu_count(),
+        memory=parse_size(memory) if memory else default_memory(),
         uploads=uploads,
         files=max_files,
         workers=workers,
         queue=queue,
         body_timeout=body_timeout,
         grace=grace,
-        **{name: value for name, value in chosen.items() if value is not None},
     )
     with listen(host, port) as listener:
         _run(settings, listener, log_level)

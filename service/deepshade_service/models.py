@@ -23,18 +23,18 @@ Key = tuple[Path, Backend]
 class Models:
     """Bundles by effect and name, and engines for them, each loaded when it is first asked for.
 
-    `engine` and `precision` pin what every request runs on that pins nothing itself. Only for
+    `pinned` is the engine and the precision of every request that pins nothing itself. Only for
     use on the event loop; what blocks is done in threads.
     """
 
     def __init__(
-        self, root: Path, *, threads: int, engine: str | None = None, precision: str | None = None
+        self, root: Path, *, threads: int, pinned: tuple[str | None, str | None] = (None, None)
     ) -> None:
         self.root = root
         self.ready = False
         self.refused: list[str] = []
         self._threads = threads
-        self._pinned = engine, precision
+        self._pinned = pinned
         self._bundles: dict[str, dict[str, Bundle]] = {}
         self._engines: OrderedDict[Key, Engine] = OrderedDict()
         self._loading: dict[Key, asyncio.Task[Engine]] = {}

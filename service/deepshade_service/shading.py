@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import json
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,7 +93,7 @@ class Shader:
         need = need_of(headers, bundle, self.memory.total)
         engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
         async with self.memory.hold(need.total):
-            return await self.workers.run(_tidy(work, need, engine))
+            return await self.workers.run(_giving_back(engine, need)(work))
 
     async def _select(
         self, headers: list[exr.Header], asked: ShadeParameters, candidates: list[Candidate]
@@ -224,21 +225,15 @@ def encode(
     return stream.getvalue(), "image/x-exr"
 
 
-def _tidy(
-    work: Callable[[threading.Event], Shaded], need: Need, engine: Engine | None
-) -> Callable[[threading.Event], Shaded]:
-    """The same work, after which memory is given back if it was much."""
-    if need.total <= _BIG or engine is None:
-        return work
-
-    def tidied(cancelled: threading.Event) -> Shaded:
-        try:
-            return work(cancelled)
-        finally:
+@contextmanager
+def _giving_back(engine: Engine | None, need: Need) -> Iterator[None]:
+    """Memory that the block leaves behind is given back if it was much."""
+    try:
+        yield
+    finally:
+        if engine is not None and need.total > _BIG:
             engine.shrink()
             trim()
-
-    return tidied
 
 
 def _radius(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> tuple[float, str]:

@@ -37,7 +37,7 @@ def many(tmp_path, make_bundle):
 
 @pytest.fixture
 def three(root):
-    models = Models(root, threads=1, engine="onnxruntime")
+    models = Models(root, threads=1, pinned=("onnxruntime", None))
     asyncio.run(models.load())
     return models
 
@@ -223,7 +223,7 @@ def test_a_name_chooses(three):
 def test_without_a_default_the_least_error_is_chosen(tmp_path, make_bundle):
     for name, error in (("a", 0.05), ("z", 0.03)):
         make_bundle(tmp_path / "ao" / name, dssim=error)
-    models = Models(tmp_path, threads=1, engine="onnxruntime")
+    models = Models(tmp_path, threads=1, pinned=("onnxruntime", None))
     asyncio.run(models.load())
     assert chosen(models) == "z"
 
