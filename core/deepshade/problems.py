@@ -32,7 +32,7 @@ _KINDS: tuple[tuple[type[DeepshadeError], int, str], ...] = (
     (DeepshadeError, 422, "unusable-input"),
 )
 _FACTS = ("missing", "found", "near", "attribute", "candidates", "limit", "value", "maximum")
-_MOST = 200  # entries of a list; a file may have thousands of channels
+MAX_ENTRIES = 200  # entries of a list; a file may have thousands of channels
 
 
 def kind_of(error: DeepshadeError) -> tuple[int, str]:
@@ -52,7 +52,7 @@ def type_uri(kind: str) -> str:
 
 def _short(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {name: _short(entry) for name, entry in list(value.items())[:_MOST]}
+        return {name: _short(entry) for name, entry in list(value.items())[:MAX_ENTRIES]}
     if isinstance(value, tuple | list | set):
-        return [str(entry)[:200] for entry in list(value)[:_MOST]]
+        return [str(entry)[:200] for entry in list(value)[:MAX_ENTRIES]]
     return value

@@ -1,78 +1,23 @@
-"""What a report compares: a way to shade a view, and the view."""
+"""What is compared: bundles on engines, the paper's network, and the interface of baselines."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deepshade.camera import Camera
-from deepshade.errors import DataError
+from deepshade import tensors
+from deepshade.bundles import Bundle, bundle_folders
+from deepshade.engines import Engine, available, load_engine
+from deepshade.errors import DeepshadeError
+from deepshade_report.view import Float, View
 
-Float = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class View:
-    """One picture's attributes and its reference.
-
-    `normal` and `position` are (3, H, W), camera space, scene units; `background` is (H, W), and
-    both attributes are zero where it is true. `radius` is the effect's, in scene units; `fov` the
-    full horizontal angle of the frame that the view shows or is a window of, in degrees.
-    `reference` is (H, W) in [0, 1], 1 = open. `pixels_per_unit` are the pixels that a length of 1
-    spans at distance 1, and `axis` is the pixel (column, row) that the optical axis meets, both
-    as the frame's width and the window's place give them: None means that the view is the frame.
-    `record` is what the data set's manifest keeps to render the sample again (scene, camera).
-    """
-
-    scene: str
-    normal: Float
-    position: Float
-    background: NDArray[np.bool_]
-    radius: float
-    fov: float
-    reference: Float
-    pixels_per_unit: float | None = None
-    axis: tuple[float, float] | None = None
-    record: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def height(self) -> int:
-        """Rows."""
-        return int(self.background.shape[0])
-
-    @property
-    def width(self) -> int:
-        """Columns."""
-        return int(self.background.shape[1])
-
-    def pixel_scale(self) -> float:
-        """Pixels that a horizontal length of 1 at distance 1 spans."""
-        if self.pixels_per_unit is not None:
-            return self.pixels_per_unit
-        return Camera(self.fov, self.width, self.height).pixels_per_unit
-
-    def optical_axis(self) -> tuple[float, float]:
-        """Column and row, in pixels from the top left corner, where the optical axis lies."""
-        return (self.width / 2, self.height / 2) if self.axis is None else self.axis
-
-    def camera(self) -> Camera:
-        """The camera that the view was rendered with, with its place in the world.
-
-        Raises DataError when the view's record holds none.
-        """
-        try:
-            known = self.record["camera"]
-            (width, height), (x0, y0) = known["frame"], known["origin"]
-            return Camera(known["fov"], width, height, known["world_to_camera"], x0, y0)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(
-                f"the view of {self.scene} has no camera: {error}",
-                fix="use a data set that 'deepshade datagen' wrote",
-            ) from error
+QUALITIES = ("fast", "balanced", "best")
+PAPER = "paper"
+NETWORK, PAPER_NETWORK = "network", "paper's network"
 
 
 class Method(Protocol):
@@ -80,8 +25,7 @@ class Method(Protocol):
 
     `family` groups methods in plots; `settings` are what tells this one from others of its name.
     `prepare` does what isn't part of shading a frame (load, compile, open the scene) and keeps
-    the view; `shade` computes the prepared view's (H, W) image, values as the reference has them,
-    and is what gets timed.
+    the view; `shade` computes the prepared view, and is what gets timed.
     """
 
     name: str
@@ -92,5 +36,84 @@ class Method(Protocol):
         """Make ready to shade `view`. Raises DeepshadeError where that can't be."""
 
     def shade(self, view: View) -> Float:
-        """(H, W) of `view`, which was prepared last."""
+        """(C, H, W), or (H, W) for one channel, of `view`, which was prepared last."""
         ...
+
+
+@dataclass
+class Network:
+    """A bundle's bare network on one engine, as a Method: input ready, nothing skipped."""
+
+    bundle: Bundle
+    engine: Engine
+    name: str
+    family: str = NETWORK
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        backend = self.engine.backend
+        self.settings = {"engine": backend.engine, "precision": backend.precision}
+        self._ready: Float = np.empty((1, 0, 0, 0), np.float32)
+
+    def prepare(self, view: View) -> None:
+        """Make the network's input. Raises DeepshadeError for an attribute that the view lacks."""
+        if missing := [name for name in self.bundle.inputs if name not in view.attributes]:
+            raise DeepshadeError(
+                f"bundle {self.bundle.name} needs {', '.join(missing)}, which the views lack",
+                fix="render the data set again, with these attributes",
+            )
+        self._ready = tensors.tensor(
+            view.effect,
+            view.attributes,
+            self.bundle.inputs,
+            view.radius,
+            per_channel=self.bundle.per_channel,
+            multiple=self.bundle.size_multiple,
+        )
+        self.engine.prepare(*self._ready.shape[2:])
+
+    def shade(self, view: View) -> Float:
+        """(C, H, W) of the prepared view."""
+        answer = self.engine.predict(self._ready)  # (N, C, h, w), N runs for colour channels
+        return answer.reshape(-1, *answer.shape[2:])[:, : view.height, : view.width]
+
+
+def bundles(models: Path, effect: str) -> list[Bundle]:
+    """The served bundles of an effect, the shipped qualities first, from fast to best.
+
+    Raises BundleError for a damaged one. One called `paper` is the baseline, not served.
+    """
+    folders = [path for path in bundle_folders(models) if path.parent.name == effect]
+    found = [Bundle.load(path) for path in folders if path.name != PAPER]
+    rank = {name: index for index, name in enumerate(QUALITIES)}
+    return sorted(found, key=lambda bundle: (rank.get(bundle.name, len(rank)), bundle.name))
+
+
+def paper_bundle(paper: Path | None, models: Path, effect: str) -> Bundle | None:
+    """The paper's network: the folder that was named, else models/<effect>/paper, else None.
+
+    Raises BundleError when the named folder holds none.
+    """
+    folder = paper or models / effect / PAPER
+    return Bundle.load(folder) if paper or folder.is_dir() else None
+
+
+def networks(served: list[Bundle], paper: Bundle | None, threads: int) -> Iterator[Network]:
+    """Every bundle on every backend that this machine has; what can't be loaded is left out."""
+    for bundle in [*served, *([paper] if paper else [])]:
+        name, family = (PAPER, PAPER_NETWORK) if bundle is paper else (bundle.name, NETWORK)
+        for backend in available():
+            try:
+                engine = load_engine(bundle, backend, threads=threads)
+                engine.warm()
+            except DeepshadeError:
+                continue
+            yield Network(bundle, engine, name, family)
+
+
+def identity(method: Method) -> str:
+    """One line that tells the method and its settings from all others."""
+    settings = method.settings
+    if {"engine", "precision"} <= set(settings):
+        return f"{method.name} {settings['engine']}/{settings['precision']}"
+    return " ".join([method.name, *(f"{key}={value}" for key, value in settings.items())])

@@ -1,31 +1,34 @@
-"""Timing several things side by side: alternating rounds, so that drift hits all alike."""
+"""The one way that times are taken: tasks in turns, medians and quartiles over rounds."""
 
 from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
-T = TypeVar("T")
+import numpy as np
+
+Figures = dict[str, list[float]]  # by name, one value a round
 
 _PAUSE = 0.004  # seconds in which the previous library's threads stop spinning
-_BURST = 0.05  # seconds of one thing before it is another's turn, at least one run
-_MOST = 8  # runs of a burst
+_BURST = 0.05  # seconds of one task before it is another's turn, at least one run
+_MAX_RUNS = 8  # of a burst
 _SLOW = 0.25  # seconds from which on a run needs no untimed one before it
+_DIGITS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How long to measure: seconds for all rounds together, and how many rounds at least, at most.
+    """How long to measure: seconds for all rounds together, and the least and most rounds.
 
-    Once `seconds` are over no new round begins, unless fewer than `fewest` were made.
+    Once `seconds` are over no new round begins, unless fewer than `min_rounds` were made.
     """
 
     seconds: float
-    fewest: int = 3
-    most: int = 20
+    min_rounds: int = 3
+    max_rounds: int = 20
 
 
 def alternate(
@@ -35,55 +38,75 @@ def alternate(
     advance: Callable[[float, str], None] = lambda share, name: None,
     clock: Callable[[], float] = time.perf_counter,
     pause: Callable[[float], None] = time.sleep,
-) -> dict[str, list[float]]:
-    """Milliseconds of each task, one figure a round: the median of a short burst of runs.
+) -> dict[str, Figures]:
+    """Figures of each task, one value a round; "ms" are the milliseconds of a run.
 
-    A round visits all tasks in an order of its own (seeded). Each visit begins with an untimed
-    run, which loads caches and wakes threads, unless a run is long. `advance` hears the share
-    that is done, 0 to 1, and which task comes next. `clock` and `pause` are for tests.
+    A round visits all tasks in an order of its own (seeded), so that drift of the machine hits all
+    alike. A visit is a short burst of runs, of which the one of median time counts; it begins with
+    an untimed run, which loads caches and wakes threads, unless a run is long. What a task returns
+    as a dict are figures of its run, beside "ms" or instead of it. `advance` hears the share that
+    is done, 0 to 1, and which task comes next. `clock` and `pause` are for tests.
     """
-    typical = {}
-    for name, task in tasks.items():
+
+    def run(name: str) -> tuple[float, dict[str, float]]:
+        begin = clock()
+        told = tasks[name]()
+        ms = 1e3 * (clock() - begin)
+        figures = {"ms": ms, **(told if isinstance(told, dict) else {})}
+        return figures["ms"], figures
+
+    typical: dict[str, float] = {}
+    for name in tasks:
         advance(0.0, name)
-        task()  # the first run sets up what later ones reuse
-        start = clock()
-        task()
-        typical[name] = max(clock() - start, 1e-7)
-    times: dict[str, list[float]] = {name: [] for name in tasks}
-    for share, name in visits(list(tasks), pace, clock=clock):
-        advance(share, name)
-        pause(_PAUSE)
-        times[name].append(_visit(tasks[name], typical[name], clock))
-    return times
-
-
-def visits(
-    names: Sequence[T], pace: Pace, *, clock: Callable[[], float] = time.perf_counter
-) -> Iterator[tuple[float, T]]:
-    """Whose turn it is, round by round, each round in an order of its own (seeded).
-
-    With each comes the share of the time that is over, 0 to 1.
-    """
-    order = list(names)
-    shuffle = random.Random(0)
-    begin = clock()
-    for turn in range(pace.most):
+        typical[name] = max(run(name)[0] / 1e3, 1e-7)  # sets up what later runs reuse
+        if typical[name] < _SLOW:
+            typical[name] = max(run(name)[0] / 1e3, 1e-7)
+    found: dict[str, Figures] = {name: {} for name in tasks}
+    order, shuffle, begin = list(tasks), random.Random(0), clock()
+    for turn in range(pace.max_rounds):
         spent = clock() - begin
-        if turn >= pace.fewest and spent + 0.5 * spent / turn > pace.seconds:
-            return
+        if turn >= pace.min_rounds and spent + 0.5 * spent / turn > pace.seconds:
+            break
         shuffle.shuffle(order)
         for number, name in enumerate(order):
-            made = (turn + number / len(order)) / pace.most
+            made = (turn + number / len(order)) / pace.max_rounds
             over = (clock() - begin) / max(pace.seconds, 1e-9)
-            yield min(1.0, max(made, over)), name
+            advance(min(1.0, max(made, over)), name)
+            pause(_PAUSE)
+            if typical[name] < _SLOW:
+                tasks[name]()
+            count = max(1, min(_MAX_RUNS, round(_BURST / typical[name])))
+            runs = sorted((run(name) for _ in range(count)), key=lambda one: one[0])
+            for figure, value in runs[count // 2][1].items():
+                found[name].setdefault(figure, []).append(value)
+    return found
 
 
-def _visit(task: Callable[[], object], typical: float, clock: Callable[[], float]) -> float:
-    if typical < _SLOW:
-        task()
-    runs = []
-    for _ in range(max(1, min(_MOST, round(_BURST / typical)))):
-        start = clock()
-        task()
-        runs.append(clock() - start)
-    return 1e3 * sorted(runs)[len(runs) // 2]
+def spread(values: Sequence[float]) -> dict[str, Any]:
+    """Median, quartiles (linear interpolation), extremes and number of `values`.
+
+    Raises ValueError without values.
+    """
+    if not len(values):
+        raise ValueError("no values to summarise")
+    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
+    return {
+        "median": significant(middle),
+        "quartiles": [significant(low), significant(high)],
+        "least": significant(min(values)),
+        "most": significant(max(values)),
+        "count": len(values),
+    }
+
+
+def ratio(above: Sequence[float], below: Sequence[float]) -> dict[str, Any]:
+    """The spread of above/below, round by round: what both suffer in one round cancels.
+
+    Raises ValueError without a round.
+    """
+    return spread([a / b for a, b in zip(above, below, strict=False) if b > 0])
+
+
+def significant(value: float) -> float:
+    """The value with six significant digits, for files that people read."""
+    return float(f"{float(value):.{_DIGITS}g}")

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepshade import metrics
 from deepshade.camera import Camera
 from deepshade.errors import DataError, DeepshadeError, SceneError
 from deepshade.manifest import Manifest
-from deepshade_report.method import View
-from deepshade_report.views import load_views
+from deepshade_report.view import View, load_views
 
 try:
     from deepshade_report.baselines.ao import raytracing
@@ -38,13 +36,13 @@ def view(tmp_path_factory: pytest.TempPathFactory) -> View:
     )
     shard = make_shard(job, 0, folder, lambda: None)
     Manifest(job.settings(), schema(job.effects, SIZE)).with_shard(shard).write(folder)
-    (found,) = load_views(folder)
+    (found,) = load_views(folder, "ao")
     return found
 
 
 def error_of(method: raytracing.RayTracing, view: View) -> float:
     method.prepare(view)
-    return metrics.dssim(method.shade(view), view.reference)
+    return view.dssim(method.shade(view)[None])
 
 
 def plane(center: tuple[float, ...], u: tuple[float, ...], v: tuple[float, ...]) -> Mesh:
@@ -60,19 +58,19 @@ def test_the_record_alone_gives_the_stored_pixels_again(view: View) -> None:
     assert (valid == ~view.background).all()
     points = hits.p.numpy().reshape(3, -1).astype(np.float64)
     seen = (view.camera().matrix @ np.vstack([points, np.ones_like(points[:1])]))[:3]
-    apart = np.linalg.norm(seen.reshape(3, SIZE, SIZE) - view.position, axis=0)
+    apart = np.linalg.norm(seen.reshape(3, SIZE, SIZE) - view.attributes["position"], axis=0)
     assert apart[valid].max() < 1e-4 * view.radius
     # world-space normals turned by the record's matrix, stored with 16 bits
     turned = view.camera().matrix[:3, :3] @ hits.ns.numpy().reshape(3, -1)
-    assert np.abs(turned.reshape(3, SIZE, SIZE) - view.normal)[:, valid].max() < 2e-3
+    assert np.abs(turned.reshape(3, SIZE, SIZE) - view.attributes["normal"])[:, valid].max() < 2e-3
 
 
 def test_many_rays_give_the_reference(view: View) -> None:
     method = raytracing.RayTracing(1024)
     method.prepare(view)
     image = method.shade(view)
-    assert metrics.dssim(image, view.reference) < 0.015
-    assert abs(float((image - view.reference).mean())) < 1e-3
+    assert view.dssim(image[None]) < 0.015
+    assert abs(float((image - view.reference[0]).mean())) < 1e-3
 
 
 @pytest.mark.parametrize("rays", [1, 8, 256])
@@ -98,7 +96,7 @@ def test_the_noise_is_that_of_coins_and_strata_lessen_it(view: View) -> None:
     for rays in raytracing.RAYS:
         method = raytracing.RayTracing(rays)
         method.prepare(view)
-        squared[rays] = float(((method.shade(view) - view.reference) ** 2).mean())
+        squared[rays] = float(((method.shade(view) - view.reference[0]) ** 2).mean())
     coin = float((view.reference * (1 - view.reference)).mean())
     assert squared[1] == pytest.approx(coin, rel=0.1)
     for rays in raytracing.RAYS[1:]:
@@ -114,9 +112,7 @@ def test_the_denoiser_takes_most_of_the_error_of_one_ray(view: View, quality: st
     raw, clean = raytracing.RayTracing(1), raytracing.RayTracing(1, quality)
     assert error_of(clean, view) < 0.5 * error_of(raw, view)
     # and doesn't shift the whole picture
-    assert abs(float((clean.shade(view) - view.reference).mean())) < 0.02
-    assert clean.trace_ms > 0
-    assert clean.denoise_ms > 0
+    assert abs(float((clean.shade(view) - view.reference[0]).mean())) < 0.02
 
 
 def test_random_numbers_are_not_those_of_the_reference(view: View) -> None:

@@ -1,4 +1,4 @@
-"""The sweep finds better parameters, and what is shipped came out of it."""
+"""The search finds better parameters, within their ranges."""
 
 from __future__ import annotations
 
@@ -8,49 +8,45 @@ import random
 from dataclasses import fields, replace
 from importlib.resources import files
 
-import numpy as np
 import pytest
 
-from deepshade_report.baselines.ao import gtao, hbao, tuned, tuning
-from deepshade_report.baselines.ao.horizons import open_field
+from deepshade.errors import DeepshadeError
 
 from .walls import rubble
 
-DEFAULTS = {"hbao": hbao.Parameters(), "gtao": gtao.Parameters()}
+try:
+    from deepshade_report.baselines.ao import hbao, tuning
+    from deepshade_report.baselines.ao.screen import tuned
+except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
+    pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
 
 
-@pytest.mark.parametrize("subject", tuning.SUBJECTS, ids=lambda s: s.name)
-def test_any_change_stays_within_its_range(subject: tuning.Subject) -> None:
-    rng = random.Random(1)
+@pytest.mark.parametrize("name", tuning.SUBJECTS)
+def test_any_change_stays_within_its_range(name: str) -> None:
+    rng, subject = random.Random(1), tuning.SUBJECTS[name]
     base = subject.published
     for reach in (math.inf, 0.5, 0.03):
         for _ in range(50):
-            base = tuning._changed(base, subject.ranges, list(subject.ranges), reach, rng)
-            for name, (low, high, _) in subject.ranges.items():
-                assert low * 0.999 <= getattr(base, name) <= high * 1.001
+            base = tuning.changed(base, subject.ranges, list(subject.ranges), reach, rng)
+            for entry, (low, high, _) in subject.ranges.items():
+                assert low * 0.999 <= getattr(base, entry) <= high * 1.001
     assert isinstance(base.blur, int)
 
 
 @pytest.mark.slow
-def test_a_sweep_comes_near_what_the_reference_was_made_with() -> None:
-    at = (4, 4)
-    view = rubble()
-    subject = replace(tuning.SUBJECTS[0], at=at, settings=[at])
-    hidden = hbao.Parameters(intensity=2.0, power=2.0, bias=0.3)
-    view = replace(view, reference=subject.shade(open_field(view), *at, hidden))
-    found = tuning.tune(subject, [view], seconds=4.0, seed=3, windows=1)
+def test_a_search_comes_near_what_the_reference_was_made_with() -> None:
+    view, subject = rubble(), replace(tuning.SUBJECTS["hbao"], at=(4, 4))
+    hidden = hbao.HBAO(4, 4, hbao.Parameters(intensity=2.0, power=2.0, bias=0.3))
+    hidden.prepare(view)
+    view = replace(view, reference=hidden.shade(view)[None])
+    found = tuning.tune(subject, [view], seconds=4.0, seed=3)
     assert found["trials"] > 3
-    assert found["windows"]["ssim"] > found["windows"]["published"] + 0.01
-    assert found["table"][0]["ssim"] == pytest.approx(found["windows"]["ssim"], abs=1e-4)
+    assert found["dssim"]["tuned"] < found["dssim"]["published"] - 0.005
 
 
-@pytest.mark.parametrize("name", DEFAULTS)
-def test_what_is_shipped_is_the_outcome_of_a_sweep(name: str) -> None:
-    shipped = json.loads((files("deepshade_report") / "baselines/ao/tuned.json").read_text("utf-8"))
-    outcome = shipped[name]
-    assert {field.name for field in fields(DEFAULTS[name])} == set(tuned.parameters(name))
-    assert outcome["windows"]["ssim"] > outcome["windows"]["published"]
-    subject = next(s for s in tuning.SUBJECTS if s.name == name)
-    assert [tuple(row["setting"]) for row in outcome["table"]] == list(subject.settings)
-    assert all(np.isfinite(row["ssim"]) for row in outcome["table"])
-    assert all("deepshade_report.baselines.ao.tuning" in command for command in outcome["commands"])
+@pytest.mark.parametrize("name", tuning.SUBJECTS)
+def test_what_is_shipped_names_every_parameter(name: str) -> None:
+    published = tuning.SUBJECTS[name].published
+    assert {field.name for field in fields(published)} == set(tuned(name))
+    source = files("deepshade_report.baselines.ao") / "tuned.json"
+    assert json.loads(source.read_text("utf-8"))[name]["trials"] > 100

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from deepshade.camera import Camera
-from deepshade_report.method import View
+from deepshade.effects import EFFECTS
+from deepshade_report.view import View
 
 Plane = tuple[Sequence[float], float]  # normal (not unit) n and c: points with n · p = c
 
@@ -58,14 +59,16 @@ def made(
 ) -> View:
     """A view without a reference."""
     length = np.linalg.norm(normal, axis=0)
+    normal = np.where(background, 0, normal / np.where(length > 0, length, 1))
+    position = np.where(background, 0, position)
     return View(
-        scene="walls",
-        normal=np.where(background, 0, normal / np.where(length > 0, length, 1)).astype(np.float32),
-        position=np.where(background, 0, position).astype(np.float32),
-        background=background,
-        radius=radius,
-        fov=fov,
-        reference=np.ones(background.shape, np.float32),
+        "walls",
+        EFFECTS["ao"],
+        {"normal": normal.astype(np.float32), "position": position.astype(np.float32)},
+        background,
+        np.ones((1, *background.shape), np.float32),
+        radius,
+        fov,
     )
 
 
@@ -74,21 +77,18 @@ def degenerate() -> dict[str, View]:
     one = np.array([[False]])
     up = np.array([0.0, 0.0, 1.0]).reshape(3, 1, 1)
     whole = rubble(16)
-    nan = whole.position.copy()
+    normal, position = whole.attributes["normal"], whole.attributes["position"]
+    nan = position.copy()
     nan[:, ::2] = np.nan
     return {
         "one pixel": made(up, -up, one, 1.0, 50.0),
         "one pixel of background": made(up, -up, ~one, 1.0, 50.0),
-        "all background": made(whole.normal, whole.position, np.ones((16, 16), bool), 1.0, 50.0),
-        "zero normals": made(np.zeros((3, 16, 16)), whole.position, whole.background, 1.0, 50.0),
-        "normals that face away": made(-whole.normal, whole.position, whole.background, 1.0, 50.0),
-        "all at one place": made(
-            whole.normal, np.full((3, 16, 16), -1.0), whole.background, 1.0, 50.0
-        ),
-        "positions that aren't finite": View(
-            "nan", whole.normal, nan, whole.background, 1.0, 50.0, whole.reference
-        ),
-        "behind the eye": made(whole.normal, -whole.position, whole.background, 1.0, 50.0),
-        "at the eye": made(whole.normal, whole.position * 1e-20, whole.background, 1.0, 50.0),
-        "a radius below a pixel": made(whole.normal, whole.position, whole.background, 1e-6, 50.0),
+        "all background": made(normal, position, np.ones((16, 16), bool), 1.0, 50.0),
+        "zero normals": made(np.zeros((3, 16, 16)), position, whole.background, 1.0, 50.0),
+        "normals that face away": made(-normal, position, whole.background, 1.0, 50.0),
+        "all at one place": made(normal, np.full((3, 16, 16), -1.0), whole.background, 1.0, 50.0),
+        "positions that aren't finite": made(normal, nan, whole.background, 1.0, 50.0),
+        "behind the eye": made(normal, -position, whole.background, 1.0, 50.0),
+        "at the eye": made(normal, position * 1e-20, whole.background, 1.0, 50.0),
+        "a radius below a pixel": made(normal, position, whole.background, 1e-6, 50.0),
     }

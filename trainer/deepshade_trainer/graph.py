@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_AFTER = 2  # convolutions that stay in float on the way to the picture
 CONVOLUTIONS = {"Conv", "ConvTranspose", "MatMul", "Gemm"}
 # What of ONNX Runtime's basic passes would join weights to their neighbours, or rename them.
 _FUSIONS = [
@@ -96,7 +100,6 @@ def bytes_per_pixel(model: Any, name: str, shape: tuple[int, int, int]) -> int:
     `shape` is (channels, height, width) of a picture for the input `name`. A tensor lives from the
     node that makes it to the last that reads it; input and output count.
     """
-    import numpy as np
     import onnx
     import onnxruntime as ort
 
@@ -121,6 +124,54 @@ def bytes_per_pixel(model: Any, name: str, shape: tuple[int, int, int]) -> int:
         gone = {source for source in _sources(node) if last[source] == k}
         live -= sum(sizes.get(source, 0) for source in gone)  # weights aren't among the sizes
     return math.ceil(peak / (shape[1] * shape[2]))
+
+
+def int8_ranges(
+    model: Any, name: str, pictures: Sequence[NDArray[np.float32]]
+) -> dict[str, tuple[float, float]]:
+    """The ranges of what convolutions that may run in 8 bits convolve, by their weights' names.
+
+    `pictures` (N, C, H, W) go through the input `name`. Those before the first convolutions stay
+    in float, and so do the last two on the way to the picture: 8 bits there would show, as bands
+    and as noise on even surfaces (without the last but one 2.2 % more DSSIM became 0.7 %).
+    """
+    import onnx
+    import onnxruntime as ort
+
+    inner = [node for node in model.graph.node if node.op_type == "Conv" and _is_inner(node, model)]
+    watched = onnx.ModelProto()
+    watched.CopyFrom(model)
+    del watched.graph.output[:]
+    names = list(dict.fromkeys(node.input[0] for node in inner))
+    watched.graph.output.extend(onnx.ValueInfoProto(name=each) for each in names)
+    if not names:
+        return {}
+    session = ort.InferenceSession(watched.SerializeToString(), providers=["CPUExecutionProvider"])
+    low, high = dict.fromkeys(names, 0.0), dict.fromkeys(names, 1e-6)
+    for picture in pictures:
+        for each, value in zip(names, session.run(names, {name: picture}), strict=True):
+            low[each] = min(low[each], float(value.min()))
+            high[each] = max(high[each], float(value.max()))
+    return {node.input[1]: (low[node.input[0]], high[node.input[0]]) for node in inner}
+
+
+def _is_inner(node: Any, model: Any) -> bool:
+    """Whether a convolution has one or more before it and at least `MIN_AFTER` after it."""
+    before: set[str] = set()
+    for other in model.graph.node:  # ONNX keeps them in order
+        if other.op_type in CONVOLUTIONS or before.intersection(other.input):
+            before.update(other.output)
+    after = {output.name: 0 for output in model.graph.output}  # by tensor: how many at least
+    for other in reversed(model.graph.node):
+        follow = min((after[each] for each in other.output if each in after), default=None)
+        if follow is None:
+            continue
+        if other is node:
+            return follow >= MIN_AFTER and node.input[0] in before
+        count = follow + (other.op_type == "Conv")
+        for each in other.input:
+            after[each] = min(after.get(each, count), count)
+    return False
 
 
 def _sources(node: Any) -> Iterator[str]:

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from deepshade.gbuffer.channels import Layer
 
 # Names come from strangers: what is compared for a hint is bounded, whatever a file holds.
-_LONGEST_NAME = 64
-_MOST_WORDS_OF_A_NAME = 8
-_MOST_WORDS = 1024
-_CLOSE = 0.6  # difflib's ratio
+MAX_NAME = 64
+MAX_WORDS_OF_A_NAME = 8
+MAX_WORDS = 1024
+MIN_RATIO = 0.6  # difflib's ratio
 
 
 def near_misses(layers: Sequence[Layer], attributes: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -30,10 +30,10 @@ def near_misses(layers: Sequence[Layer], attributes: Sequence[str]) -> dict[str,
     best: dict[str, dict[str, float]] = {name: {} for name in attributes}
     for layer in layers:
         label = layer.name or (layer.channels[0] if len(layer.channels) == 1 else "")
-        name = label[:_LONGEST_NAME].lower()
+        name = label[:MAX_NAME].lower()
         pieces = [piece for piece in re.split(r"[._:/\-\s]+", name) if piece]
-        for piece in dict.fromkeys((name, *pieces[-_MOST_WORDS_OF_A_NAME:])):
-            if piece not in scores and len(scores) < _MOST_WORDS:
+        for piece in dict.fromkeys((name, *pieces[-MAX_WORDS_OF_A_NAME:])):
+            if piece not in scores and len(scores) < MAX_WORDS:
                 scores[piece] = _closeness(piece, words)
             for attribute, score in scores.get(piece, {}).items():
                 best[attribute][label] = max(score, best[attribute].get(label, 0.0))
@@ -63,7 +63,7 @@ def _closeness(piece: str, words: Mapping[str, Iterable[str]]) -> dict[str, floa
     for attribute, mine in words.items():
         for word in mine:
             matcher.set_seq1(word)
-            least = max(_CLOSE, found.get(attribute, 0.0))
+            least = max(MIN_RATIO, found.get(attribute, 0.0))
             # upper bounds first: nearly all words fail them
             if matcher.real_quick_ratio() >= least and matcher.quick_ratio() >= least:
                 ratio = matcher.ratio()

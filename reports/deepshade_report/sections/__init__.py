@@ -1,15 +1,45 @@
-"""What was measured, by section, and the rows that others ask for."""
+"""What was measured, by section; the points, frontier and comparisons that follow from it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from deepshade_report.subjects import NETWORK, PAPER_NETWORK, REFERENCE
+from deepshade.engines import REFERENCE
+from deepshade_report.method import NETWORK, PAPER, PAPER_NETWORK
+from deepshade_report.view import MEGAPIXELS
 
 Sections = dict[str, Any]
 Row = dict[str, Any]
 
-MOST_ADDED = 0.02
+
+class Skipped(Exception):
+    """A section can't be measured here; the message says why, for the page."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One method with its settings: milliseconds per megapixel (`cost`) and DSSIM (`error`)."""
+
+    id: str
+    name: str
+    family: str
+    cost: float
+    error: float
+    settings: dict[str, Any] = field(default_factory=dict)
+    quartiles: tuple[float, float] = (0.0, 0.0)
+    of_trivial: float = 0.0
+
+    @property
+    def milliseconds(self) -> float:
+        """At 768 x 512."""
+        return self.cost * MEGAPIXELS
+
+    @property
+    def backend(self) -> str:
+        """ "openvino/bf16" of a network."""
+        return f"{self.settings.get('engine')}/{self.settings.get('precision')}"
 
 
 def data(sections: Sections, name: str) -> dict[str, Any] | None:
@@ -25,54 +55,106 @@ def rows(sections: Sections, section: str, /, **wanted: Any) -> list[Row]:
     return [row for row in found if all(row.get(key) == value for key, value in wanted.items())]
 
 
-def backend_of(row: Row) -> str:
-    """ "openvino/bf16" of a network's row."""
-    settings = row["settings"]
-    return f"{settings.get('engine')}/{settings.get('precision')}"
+def points(sections: Sections) -> list[Point]:
+    """Every method whose error and speed both were measured."""
+    errors = {row["id"]: row for row in rows(sections, "error")}
+    return [
+        Point(
+            row["id"],
+            row["name"],
+            row["family"],
+            row["ms_per_megapixel"],
+            errors[row["id"]]["dssim"],
+            row["settings"],
+            tuple(row["ms"]["quartiles"]),
+            errors[row["id"]]["of_trivial"],
+        )
+        for row in rows(sections, "speed")
+        if row["id"] in errors
+    ]
 
 
-def default_backend(sections: Sections, name: str) -> str | None:
-    """What a bundle runs on unless it is told otherwise.
+def frontier(found: Sequence[Point]) -> list[Point]:
+    """The points that no other beats, fastest first.
 
-    What the service's answers named; where no service was measured, the fastest backend that adds
-    at most 2 % to the error in fp32.
+    One is beaten by another that is no worse in both and better in one; of equals the first counts.
     """
-    served = rows(sections, "service", bundle=name)
-    if served:
-        return str(served[0]["backend"])
-    errors = {
-        backend_of(row): float(row["dssim"])
-        for row in rows(sections, "error", name=name, family=NETWORK)
-    }
-    times = {
-        backend_of(row): float(row["ms"]["median"])
-        for row in rows(sections, "speed", name=name, family=NETWORK)
-    }
-    exact = errors.get(str(REFERENCE))
-    fit = [
-        backend
-        for backend in times
-        if exact is None or errors.get(backend, exact) <= (1 + MOST_ADDED) * exact
-    ]
-    return min(fit, key=lambda backend: times[backend]) if fit else None
+    kept: list[Point] = []
+    for point in sorted(found, key=lambda point: (point.cost, point.error)):
+        if not kept or point.error < kept[-1].error:
+            kept.append(point)
+    return kept
 
 
-def network_row(sections: Sections, section: str, name: str) -> Row | None:
-    """The row of a bundle on its default backend, or of the paper's network in fp32."""
-    paper = name == "paper"
-    backend = str(REFERENCE) if paper else default_backend(sections, name)
-    family = PAPER_NETWORK if paper else NETWORK
-    for row in rows(sections, section, name=name, family=family):
-        if backend_of(row) == backend:
-            return row
-    return None
+def standing_for(found: Sequence[Point]) -> dict[str, Point]:
+    """For each method the point that its name is written at.
+
+    A network's is the one on the engine and precision that it runs on by default, which is the
+    first that was measured; the paper's network's is that in fp32, as its authors ran it; of other
+    methods the one with the least error.
+    """
+    chosen: dict[str, Point] = {}
+    for name in dict.fromkeys(point.name for point in found):
+        own = [point for point in found if point.name == name]
+        exact = [point for point in own if point.backend == str(REFERENCE)]
+        if own[0].family == NETWORK:
+            chosen[name] = own[0]
+        elif own[0].family == PAPER_NETWORK and exact:
+            chosen[name] = exact[0]
+        else:
+            chosen[name] = min(own, key=lambda point: point.error)
+    return chosen
 
 
-def best_rival(sections: Sections, word: str) -> Row | None:
-    """The settings with the least error of the methods with `word` in their name."""
-    found = [
-        row
-        for row in rows(sections, "error")
-        if row["family"] not in (NETWORK, PAPER_NETWORK) and word in row["name"].lower()
-    ]
-    return min(found, key=lambda row: float(row["dssim"]), default=None)
+def title(name: str) -> str:
+    """What a page calls a method."""
+    return "the paper's network" if name == PAPER else name
+
+
+def summary(sections: Sections) -> list[dict[str, Any]]:
+    """One line for each network as it runs by default, the fastest first.
+
+    `like_for_like` is how much faster it is than the paper's network on the same engine, in the
+    same precision: other ratios mix what the network and what the engine gains.
+    """
+    found = points(sections)
+    named = {p.name: p for p in standing_for(found).values() if p.family == NETWORK}
+    paper = {point.backend: point for point in found if point.family == PAPER_NETWORK}
+    if paper:
+        named[PAPER] = standing_for(found)[PAPER]
+    table = []
+    for name, point in named.items():
+        beside = paper.get(point.backend)
+        table.append(
+            {
+                "name": title(name),
+                "backend": point.backend,
+                "ms": point.milliseconds,
+                "ms_per_megapixel": point.cost,
+                "dssim": point.error,
+                "of_trivial": point.of_trivial,
+                "like_for_like": beside and beside.cost / point.cost,
+                "less_error": beside and 1 - point.error / beside.error,
+            }
+        )
+    return sorted(table, key=lambda row: float(row["ms"]))
+
+
+def same_time(sections: Sections) -> list[dict[str, Any]]:
+    """For each network's time, the least error that each method reaches within it, and with what.
+
+    The paper's figure 6 as a table. A method takes part by its best settings that fit; None where
+    none does.
+    """
+    found = points(sections)
+    budgets = [p for p in standing_for(found).values() if p.family in (NETWORK, PAPER_NETWORK)]
+    table = []
+    for budget in sorted(budgets, key=lambda point: point.cost):
+        reached: dict[str, Any] = {}
+        for name in dict.fromkeys(point.name for point in found):
+            # a budget is the median of one method, so it fits itself in spite of rounding
+            fit = [p for p in found if p.name == name and p.cost <= budget.cost * 1.001]
+            best = min(fit, key=lambda point: point.error, default=None)
+            reached[name] = best and {"id": best.id, "dssim": best.error, "ms": best.milliseconds}
+        table.append({"budget": title(budget.name), "ms": budget.milliseconds, "reached": reached})
+    return table

@@ -2,41 +2,34 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from statistics import fmean
 from typing import Any
 
-import numpy as np
-
-from deepshade import metrics
-from deepshade.effects import EFFECTS
 from deepshade.errors import DeepshadeError
-from deepshade_report import baselines as contenders
-from deepshade_report import frames
+from deepshade_report.baselines import baselines
 from deepshade_report.context import Context
-from deepshade_report.method import Method, View
-from deepshade_report.statistics import significant, spread
-from deepshade_report.subjects import Network, identity, networks
-from deepshade_report.timing import alternate
+from deepshade_report.method import Method, Network, identity, networks
+from deepshade_report.timing import alternate, significant, spread
+from deepshade_report.view import HEIGHT, MEGAPIXELS, WIDTH, View, fullest, resized
 
 _SPEED_SECONDS = 100.0
 
 
 def methods(context: Context) -> tuple[list[Method], dict[str, str]]:
     """All that this machine can compare, and what is missing with the reason."""
-    found: list[Method] = list(networks(context.served, context.baseline, context.threads))
-    others, missing = contenders.rivals(context.quick)
-    if context.baseline is None:
+    found: list[Method] = list(networks(context.served, context.paper_network, context.threads))
+    others, missing = baselines(context.effect, context.quick)
+    if context.paper_network is None:
         missing["the paper's network"] = "no bundle of it: name one with --paper"
     return [*found, *others], missing
 
 
 def error(context: Context) -> dict[str, Any]:
-    """Mean DSSIM and SSIM of every method over the held-out views, beside the trivial answer's."""
-    views = context.held_out
+    """Mean DSSIM of every method over the held-out views, beside the trivial answer's."""
+    views = context.views
     found, missing = methods(context)
-    white = [dssim(np.full_like(view.reference, _blank(context)), view) for view in views]
+    trivial = fmean(view.dssim(view.trivial()) for view in views)
     errors: dict[str, list[float]] = {identity(method): [] for method in found}
     for number, view in enumerate(views):  # outermost: what traces rays keeps a view's scene
         for index, method in enumerate(found):
@@ -46,15 +39,14 @@ def error(context: Context) -> dict[str, Any]:
             context.advance((number + index / len(found)) / len(views), f"{view.scene}: {name}")
             try:
                 method.prepare(view)
-                errors[name].append(dssim(method.shade(view), view))
+                errors[name].append(view.dssim(shaded(method, view)))
             except DeepshadeError as problem:
                 missing[name] = str(problem)
     rows = [
         {
             **about(method),
             "dssim": significant(fmean(each)),
-            "ssim": significant(1 - 2 * fmean(each)),
-            "of_trivial": significant(fmean(each) / fmean(white)),
+            "of_trivial": significant(fmean(each) / trivial),
             "each": [significant(value) for value in each],
         }
         for method in found
@@ -63,85 +55,64 @@ def error(context: Context) -> dict[str, Any]:
     return {
         "views": len(views),
         "scenes": sorted({view.scene for view in views}),
-        "size": list(views[0].background.shape),
-        "trivial_dssim": significant(fmean(white)),
+        "size": [views[0].width, views[0].height],
+        "trivial_dssim": significant(trivial),
         "rows": rows,
         "missing": missing,
     }
 
 
 def speed(context: Context) -> dict[str, Any]:
-    """Milliseconds of every method, warm, in alternating rounds, on a real 768 x 512 frame."""
-    view = frames.fullest(context.held_out)
-    frame = frames.extended(view, frames.HEIGHT, frames.WIDTH)
+    """Milliseconds of every method, warm, in turns, on a real 768 x 512 frame."""
+    view = fullest(context.views)
+    frame = resized(view)
     found, missing = methods(context)
     tasks: dict[str, Callable[[], object]] = {}
-    megapixels: dict[str, float] = {}
-    kept: dict[str, Method] = {}
+    kept: dict[str, tuple[Method, float]] = {}
     for method in found:
         name = identity(method)
         # tracing rays needs the scene's own geometry, so a view as it was rendered
-        shown = view if contenders.needs_scene(method) else frame
+        shown = view if getattr(method, "needs_scene", False) else frame
+        context.advance(0.0, f"preparing {name}")
         try:
-            context.advance(0.0, f"preparing {name}")
             method.prepare(shown)
-            tasks[name] = _bound(method, shown)
-            tasks[name]()
+            method.shade(shown)
         except DeepshadeError as problem:
-            tasks.pop(name, None)
             missing[name] = str(problem)
             continue
-        megapixels[name] = shown.background.size / 1e6
-        kept[name] = method
-    began = time.perf_counter()
+        tasks[name] = _bound(method, shown)
+        kept[name] = method, shown.background.size / 1e6
     times = alternate(tasks, context.pace(_SPEED_SECONDS), advance=context.advance)
     rows = []
-    for name, method in kept.items():
-        scale = frames.MEGAPIXELS / megapixels[name]
-        rounds = [significant(value * scale) for value in times[name]]
+    for name, (method, megapixels) in kept.items():
+        ms = [value * MEGAPIXELS / megapixels for value in times[name]["ms"]]
         rows.append(
             {
                 **about(method),
-                "ms": spread(rounds),
-                "ms_per_megapixel": significant(spread(rounds)["median"] / frames.MEGAPIXELS),
-                "scaled_from_megapixels": None if scale == 1 else significant(megapixels[name]),
-                "rounds": rounds,
+                "ms": spread(ms),
+                "ms_per_megapixel": significant(spread(ms)["median"] / MEGAPIXELS),
+                "measured_megapixels": significant(megapixels),
             }
         )
     return {
-        "frame": [frames.WIDTH, frames.HEIGHT],
+        "frame": [WIDTH, HEIGHT],
         "background": significant(frame.background.mean()),
-        "seconds": significant(time.perf_counter() - began),
         "rows": rows,
         "missing": missing,
     }
 
 
+def shaded(method: Method, view: View) -> Any:
+    """(C, H, W) of the prepared view."""
+    return method.shade(view).reshape(view.reference.shape)
+
+
 def about(method: Method) -> dict[str, Any]:
     """Who a row is about."""
-    row: dict[str, Any] = {
-        "id": identity(method),
-        "name": method.name,
-        "family": method.family,
-        "settings": {key: _plain(value) for key, value in method.settings.items()},
-    }
-    if isinstance(method, Network):
-        row["sha256"] = method.bundle.sha256
-    return row
-
-
-def dssim(image: Any, view: View) -> float:
-    """DSSIM against the view's reference, both clamped to [0, 1]."""
-    return metrics.dssim(np.clip(image, 0, 1), np.clip(view.reference, 0, 1))
-
-
-def _blank(context: Context) -> float:
-    return EFFECTS[context.effect].background
+    row: dict[str, Any] = {"id": identity(method), "name": method.name, "family": method.family}
+    row["settings"] = dict(method.settings)
+    return row | ({"sha256": method.bundle.sha256} if isinstance(method, Network) else {})
 
 
 def _bound(method: Method, view: View) -> Callable[[], object]:
     return lambda: method.shade(view)
-
-
-def _plain(value: object) -> object:
-    return value if isinstance(value, (str, int, float, bool)) or value is None else str(value)

@@ -17,18 +17,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
-import torch
-from torch import Tensor
+import drjit as dr
 
-from deepshade_report.baselines.ao import tuned
-from deepshade_report.baselines.ao.horizons import Field, Slice, blocks, finish, march, slices
-from deepshade_report.baselines.ao.marching import Marching
-from deepshade_report.method import Float, Method
-
-if TYPE_CHECKING:
-    from deepshade_report.baselines.ao.compiled import Screen
+from deepshade_report.baselines.ao.screen import (
+    TINY,
+    Marching,
+    Screen,
+    mi,
+    opaque,
+    plane,
+    sample,
+    start,
+    stride,
+    tuned,
+)
+from deepshade_report.method import Method
 
 # slices and steps to each side, from cheap to best
 SETTINGS = ((1, 2), (2, 2), (2, 4), (3, 6), (6, 8), (9, 12))
@@ -62,73 +67,64 @@ class Parameters:
     edge: float = 0.2
 
 
-def occlude(field: Field, count: int, steps: int, p: Parameters) -> Float:
-    """(H, W) ambient occlusion in [0, 1], 1 = open: `count` slices, `steps` to either side."""
-    result = torch.empty(len(field.pixels))
-    fade = 1 / (p.radius * p.falloff)
-    stretch = (1 + p.thin) ** 2 - 1
-    for some, block in blocks(field):
-        total = torch.zeros_like(block.reach)
-        for index, plane in slices(block, count):
-            low, horizon = plane.low, plane.low.clone()
-            samples = march(block, plane, index, steps, reach=p.radius, spread=p.spread)
-            for elevation, squared, depth in samples:
-                if stretch:
-                    squared.addcmul_(depth, depth, value=stretch)
-                weight = squared.sqrt_().mul_(-fade).add_(1 / p.falloff).clamp_(0, 1)
-                if p.bias:
-                    elevation.sub_(p.bias)
-                seen = torch.lerp(low, elevation, weight)
-                if p.thickness:
-                    sunk = torch.lerp(horizon, seen, p.thickness)
-                    horizon = torch.where(seen >= horizon, seen, sunk)
-                else:
-                    horizon = torch.maximum(horizon, seen)
-            total += _arc(plane, torch.maximum(horizon, low), block.facing)
-        visible = total.mul_(1 / count)
-        visible = visible.sub_(1).mul_(p.intensity).add_(1).clamp_(0, 1)
-        result[some] = visible if p.power == 1 else visible.pow_(p.power)
-    return finish(field, result, blur=p.blur, edge=p.edge)
-
-
-def _arc(plane: Slice, horizon: Tensor, facing: Tensor) -> Tensor:
-    """The integral of a slice (n,), between its two horizons' cosines from the eye's ray (2, n)."""
-    # an elevation's sine is its angle's cosine from the eye's ray
-    cos_h = horizon.clamp(-1, 1)
-    h = cos_h.acos()
-    sin_h = (1 - cos_h * cos_h).clamp_(min=0).sqrt_()
-    sin = plane.low[1]
-    cos = facing / plane.length.clamp(min=1e-12)
-    # to the second side angles count as negative
-    sides = (h[0] - h[1]) * 2 * sin + 2 * cos
-    double_cos = 2 * cos_h * cos_h - 1
-    double_sin = 2 * cos_h * sin_h
-    sides -= (double_cos[0] + double_cos[1]) * cos + (double_sin[0] - double_sin[1]) * sin
-    return sides.mul_(0.25).mul_(plane.length).clamp_(min=0)
-
-
 class GTAO(Marching):
     """GTAO as a Method."""
 
     name = "GTAO"
 
     def __init__(self, count: int, steps: int, parameters: Parameters | None = None) -> None:
-        super().__init__({"slices": count, "steps": steps})
-        self.count, self.steps = count, steps
-        self.parameters = parameters or default()
+        settings = {"slices": count, "steps": steps}
+        super().__init__(settings, parameters or Parameters(**tuned("gtao")))
 
-    def march(self, screen: Screen) -> Float:
+    def march(self, screen: Screen) -> Any:
         """See `Marching.march`."""
-        from deepshade_report.baselines.ao import compiled
-
-        return compiled.gtao(screen, self.count, self.steps, self.parameters)
-
-
-def default() -> Parameters:
-    """The tuned parameters."""
-    return Parameters(**tuned.parameters("gtao"))
+        p, (count, steps) = self.parameters, self.counts
+        counts = [dr.opaque(mi.UInt32, value) for value in (count, steps)]
+        given = p.radius, p.falloff, p.bias, p.thickness, p.thin, p.spread, p.intensity, p.power
+        return _march(screen, *counts, *opaque(*given))
 
 
 def methods(quick: bool) -> Sequence[Method]:
     """GTAO at its settings, from cheap to best; in a quick report, two of them."""
     return [GTAO(count, steps) for count, steps in (QUICK if quick else SETTINGS)]
+
+
+@dr.syntax
+def _march(screen: Screen, slices: Any, steps: Any, *given: Any) -> Any:
+    radius, falloff, bias, thickness, thin, spread, intensity, power = given
+    column, row = screen.pixels()
+    here, eye, facing, reach, active = start(screen, column, row)
+    fade = -1 / (radius * falloff)
+    stretch = dr.square(1 + thin) - 1
+    total = mi.Float(0)
+    index = mi.UInt32(0)
+    while (index < slices) & active:
+        sin, cos, length, tilt = plane(screen, eye, facing, index, slices)
+        first, second = mi.Float(-tilt), mi.Float(tilt)
+        step = mi.UInt32(0)
+        while step < steps:
+            right, down = stride(screen, reach * radius, spread, index, step, steps, cos, sin)
+            seen = []
+            for side, low in ((1, -tilt), (-1, tilt)):  # unrolled
+                elevation, squared, deep = sample(screen, here, eye, column, row, right, down, side)
+                far = dr.sqrt(dr.fma(dr.square(deep), stretch, squared))
+                weight = dr.clip(dr.fma(far, fade, 1 / falloff), 0, 1)
+                seen.append(dr.lerp(low, elevation - bias, weight))
+            first = _raised(first, seen[0], thickness)
+            second = _raised(second, seen[1], thickness)
+            step += 1
+        h0 = dr.acos(dr.clip(dr.maximum(first, -tilt), -1, 1))
+        h1 = -dr.acos(dr.clip(dr.maximum(second, tilt), -1, 1))
+        cosine = facing / dr.maximum(length, TINY)
+        angle = dr.safe_acos(cosine)
+        lean = dr.select(tilt < 0, -angle, angle)
+        arc = 2 * cosine + 2 * (h0 + h1) * tilt - dr.cos(2 * h0 - lean) - dr.cos(2 * h1 - lean)
+        total += dr.maximum(arc * 0.25 * length, 0)
+        index += 1
+    visible = dr.clip(1 + (total / mi.Float(slices) - 1) * intensity, 0, 1)
+    return dr.select(active, dr.power(visible, power), 1)
+
+
+def _raised(horizon: Any, seen: Any, thickness: Any) -> Any:
+    """The horizon after a sample; it sinks towards lower ones as if occluders were thin."""
+    return dr.select(seen >= horizon, seen, dr.lerp(horizon, seen, thickness))

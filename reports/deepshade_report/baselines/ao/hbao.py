@@ -13,20 +13,24 @@ come in opposite pairs, turned by a per-pixel jitter, and a depth-aware blur tak
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
-import torch
+import drjit as dr
 
-from deepshade_report.baselines.ao import tuned
-from deepshade_report.baselines.ao.horizons import Field, Slice, blocks, finish, march, slices
-from deepshade_report.baselines.ao.marching import Marching
-from deepshade_report.method import Float, Method
-
-if TYPE_CHECKING:
-    from deepshade_report.baselines.ao.compiled import Screen
+from deepshade_report.baselines.ao.screen import (
+    Marching,
+    Screen,
+    mi,
+    opaque,
+    plane,
+    sample,
+    start,
+    stride,
+    tuned,
+)
+from deepshade_report.method import Method
 
 # directions and steps a direction, from cheap to best
 SETTINGS = ((4, 2), (4, 4), (8, 4), (8, 8), (16, 8))
@@ -55,58 +59,60 @@ class Parameters:
     edge: float = 0.2
 
 
-def occlude(field: Field, directions: int, steps: int, p: Parameters) -> Float:
-    """(H, W) ambient occlusion in [0, 1], 1 = open, from `directions` (even) x `steps` samples."""
-    result = torch.empty(len(field.pixels))
-    pairs = max(directions // 2, 1)
-    for some, block in blocks(field):
-        total = torch.zeros_like(block.reach)
-        for index, plane in slices(block, pairs):
-            horizon = _start(plane, p.bias)
-            rise_sum = torch.zeros_like(horizon)
-            samples = march(block, plane, index, steps, reach=p.radius, spread=p.spread)
-            for elevation, squared, _ in samples:
-                slope = 1 / (p.radius**2 * p.falloff)
-                weight = squared.mul_(-slope).add_(1 / p.falloff).clamp_(0, 1)
-                rise = elevation.sub_(horizon).clamp_(min=0).mul_(weight > 0)
-                rise_sum.addcmul_(weight, rise)
-                horizon.add_(rise)
-            total += rise_sum.sum(0)
-        visible = total.mul_(-p.intensity / (2 * pairs)).add_(1).clamp_(0, 1)
-        result[some] = visible if p.power == 1 else visible.pow_(p.power)
-    return finish(field, result, blur=p.blur, edge=p.edge)
-
-
-def _start(plane: Slice, bias: float) -> torch.Tensor:
-    """sin(t + bias), never past the zenith."""
-    sin = plane.low
-    cos = (1 - sin * sin).clamp_(min=0).sqrt_()
-    raised = sin * math.cos(bias) + cos * math.sin(bias)
-    return torch.where(cos < math.sin(bias), torch.maximum(sin, raised), raised)
-
-
 class HBAO(Marching):
     """HBAO as a Method."""
 
     name = "HBAO"
 
     def __init__(self, directions: int, steps: int, parameters: Parameters | None = None) -> None:
-        super().__init__({"directions": directions, "steps": steps})
-        self.directions, self.steps = directions, steps
-        self.parameters = parameters or default()
+        settings = {"directions": directions, "steps": steps}
+        super().__init__(settings, parameters or Parameters(**tuned("hbao")))
 
-    def march(self, screen: Screen) -> Float:
+    def march(self, screen: Screen) -> Any:
         """See `Marching.march`."""
-        from deepshade_report.baselines.ao import compiled
-
-        return compiled.hbao(screen, self.directions, self.steps, self.parameters)
-
-
-def default() -> Parameters:
-    """The tuned parameters."""
-    return Parameters(**tuned.parameters("hbao"))
+        p, (directions, steps) = self.parameters, self.counts
+        counts = [dr.opaque(mi.UInt32, value) for value in (max(directions // 2, 1), steps)]
+        given = p.radius, p.falloff, p.bias, p.spread, p.intensity, p.power
+        return _march(screen, *counts, *opaque(*given))
 
 
 def methods(quick: bool) -> Sequence[Method]:
     """HBAO at its settings, from cheap to best; in a quick report, two of them."""
     return [HBAO(directions, steps) for directions, steps in (QUICK if quick else SETTINGS)]
+
+
+@dr.syntax
+def _march(screen: Screen, pairs: Any, steps: Any, *given: Any) -> Any:
+    radius, falloff, bias, spread, intensity, power = given
+    column, row = screen.pixels()
+    here, eye, facing, reach, active = start(screen, column, row)
+    slope = -1 / (dr.square(radius) * falloff)
+    total = mi.Float(0)
+    index = mi.UInt32(0)
+    while (index < pairs) & active:
+        sin, cos, _, tilt = plane(screen, eye, facing, index, pairs)
+        first, second = _lifted(-tilt, bias), _lifted(tilt, bias)
+        step = mi.UInt32(0)
+        while step < steps:
+            right, down = stride(screen, reach * radius, spread, index, step, steps, cos, sin)
+            rises = []
+            for side, horizon in ((1, first), (-1, second)):  # unrolled
+                elevation, squared, _ = sample(screen, here, eye, column, row, right, down, side)
+                weight = dr.clip(dr.fma(squared, slope, 1 / falloff), 0, 1)
+                rise = dr.select(weight > 0, dr.maximum(elevation - horizon, 0), 0)
+                total = dr.fma(weight, rise, total)
+                rises.append(rise)
+            first += rises[0]
+            second += rises[1]
+            step += 1
+        index += 1
+    visible = dr.clip(1 - total * intensity / (2 * mi.Float(pairs)), 0, 1)
+    return dr.select(active, dr.power(visible, power), 1)
+
+
+def _lifted(sin: Any, bias: Any) -> Any:
+    """sin(t + bias), never past the zenith."""
+    cos = dr.safe_sqrt(1 - dr.square(sin))
+    up, over = dr.sincos(bias)
+    lifted = sin * over + cos * up
+    return dr.select(cos < up, dr.maximum(sin, lifted), lifted)

@@ -1,0 +1,326 @@
+"""A quick report of tiny bundles over a tiny data set: of a factor, and of light by channel."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnx.reference
+import pytest
+import typer
+from onnx import TensorProto, helper, numpy_helper
+from safetensors.numpy import save
+from typer.testing import CliRunner
+
+from deepshade import exr, metrics
+from deepshade.bundles import Bundle, write_config
+from deepshade.camera import Camera
+from deepshade.effects import EFFECTS
+from deepshade.engines import REFERENCE, load_engine
+from deepshade.errors import ConfigError, DataError
+from deepshade.gbuffer.derivation import normals_from_positions
+from deepshade.manifest import Manifest, Shard
+from deepshade_report import baselines, page, plots, report
+from deepshade_report.cli import report as command
+from deepshade_report.context import Context
+from deepshade_report.method import Network
+from deepshade_report.sections import Point, Skipped, frontier, points, same_time, summary
+from deepshade_report.view import body, load_views, resized
+
+SIZE = 64
+
+
+def write_bundle(folder: Path, width: int, seed: int) -> None:
+    """Two 3x3 convolutions; of one colour channel where the effect is by channel."""
+    effect, rng = EFFECTS[folder.parent.name], np.random.default_rng(seed)
+    channels = 7 if effect.per_channel else 6
+    weights = [
+        numpy_helper.from_array(np.abs(rng.normal(0, 0.2, shape)).astype(np.float32), name)
+        for name, shape in (("a", (width, channels, 3, 3)), ("b", (1, width, 3, 3)))
+    ]
+    nodes = [
+        helper.make_node("Conv", ["gbuffer", "a"], ["x"], pads=[1] * 4),
+        helper.make_node("Relu", ["x"], ["y"]),
+        helper.make_node("Conv", ["y", "b"], ["shade"], pads=[1] * 4),
+    ]
+    ends = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["N", count, "H", "W"])
+        for name, count in (("gbuffer", channels), ("shade", 1))
+    ]
+    graph = helper.make_graph(nodes, "tiny", ends[:1], ends[1:], weights)
+    opset = [helper.make_opsetid("", 18)]
+    folder.mkdir(parents=True)
+    model = helper.make_model(graph, opset_imports=opset, ir_version=10)
+    (folder / "model.onnx").write_bytes(model.SerializeToString())
+    config: dict[str, Any] = {
+        "effect": effect.name,
+        "name": folder.name,
+        "inputs": effect.inputs,
+        "outputs": effect.outputs,
+        "per_channel": effect.per_channel,
+        "radius": 0.5,
+        "fov": 50.0,
+        "size_multiple": 8,
+        "halo": 2,
+        "bytes_per_pixel": 100,
+    }
+    write_config(folder, config, {})
+
+
+def write_data(folder: Path, effect: str, count: int = 3) -> None:
+    folder.mkdir(parents=True)
+    samples = []
+    for k in range(count):
+        y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE
+        wave = np.sin((6 + k) * x) * np.sin(9 * y)
+        depth = (4 + 0.3 * wave).astype(np.float32)
+        depth[: 2 * k] = np.inf
+        there = np.isfinite(depth)
+        position = Camera(50, SIZE, SIZE).position_from_depth(depth)
+        position[:, ~there] = 0
+        sample = {
+            "position": position.astype(np.float32),
+            "normal": normals_from_positions(position, there).astype(np.float16),
+        }
+        answer = np.where(there, 0.6 - 0.35 * wave, 1)[None]
+        if EFFECTS[effect].per_channel:
+            answer = np.where(there, 1e5 * (0.6 - 0.35 * wave), 0) * np.ones((3, 1, 1))
+            sample["light_diffuse"] = (answer * 1.5).astype(np.float32)
+        samples.append({**sample, f"reference_{effect}": answer.astype(np.float32)})
+    content = save({name: np.stack([s[name] for s in samples]) for name in samples[0]})
+    (folder / "shard-00000.safetensors").write_bytes(content)
+    camera = {"fov": 50.0, "frame": [SIZE, SIZE], "origin": [0, 0]}
+    camera["world_to_camera"] = np.eye(4).tolist()
+    records = [
+        {"scene": f"wave:{k}", "seed": k, "radius": 0.5, "camera": camera} for k in range(count)
+    ]
+    schema = {n: {"dtype": str(v.dtype), "shape": list(v.shape)} for n, v in samples[0].items()}
+    digest = hashlib.sha256(content).hexdigest()
+    shard = Shard("shard-00000.safetensors", digest, records)
+    Manifest({"test": True}, schema).with_shard(shard).write(folder)
+
+
+@pytest.fixture(scope="module", params=["ao", "gi"])
+def root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp(request.param) / request.param
+    write_bundle(folder / "models" / request.param / "fast", 4, 0)
+    write_bundle(folder / "models" / request.param / "paper", 16, 1)
+    write_data(folder / "data", request.param)
+    return folder
+
+
+def arguments(root: Path, *more: str) -> list[str]:
+    found = [f"--{name}={root / name}" for name in ("models", "data", "out")]
+    return [*found, f"--effect={root.name}", *more]
+
+
+def run(*options: str) -> tuple[int, str]:
+    app = typer.Typer()
+    app.command()(command)
+    result = CliRunner().invoke(app, list(options), catch_exceptions=False)
+    return result.exit_code, result.output
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+def test_a_quick_report_has_every_section(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(baselines, "folder", lambda effect: None)
+    code, output = run(*arguments(root, "--quick"))
+    assert code == 0, output
+    found = json.loads((root / "out" / "report.json").read_text())
+    sections = found["sections"]
+    assert {name: s.get("reason") for name, s in sections.items() if s["status"] != "done"} == {}
+    ids = {row["id"] for row in sections["speed"]["data"]["rows"]}
+    assert {"fast onnxruntime/fp32", "paper onnxruntime/fp32"} <= ids
+    (service,) = sections["service"]["data"]["rows"]
+    assert service["total_ms"]["median"] > service["bare_ms"]["median"] > 0
+    sizes = sections["sizes"]["data"]["rows"]
+    assert sizes[-1]["width"] == 1024
+    assert (root / "out" / "comparison.png").stat().st_size > 10_000
+    assert (root / "out" / "speed-error.png").exists()
+    assert "index.html" in output
+    assert run(*arguments(root, "--quick", "--resume"))[0] == 0
+    assert json.loads((root / "out" / "report.json").read_text())["sections"] == sections
+
+
+def test_speed_against_error_of_any_effect(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(baselines, "folder", lambda effect: None)
+    out = root / "short"
+    options = arguments(root, "--quick", "--only=error", "--only=speed", f"--out={out}")
+    assert run(*options)[0] == 0
+    sections = json.loads((out / "report.json").read_text())["sections"]
+    assert list(sections) == ["error", "speed"]
+    views = load_views(root / "data", root.name, 2)
+    error = sections["error"]["data"]
+    row = next(row for row in error["rows"] if row["id"] == "fast onnxruntime/fp32")
+    bundle = Bundle.load(root / "models" / root.name / "fast")
+    graph = onnx.reference.ReferenceEvaluator(onnx.load(bundle.model))
+    expected, trivial = [], []
+    for view in views:
+        a = view.attributes
+        runs = [[a["normal"], a["position"] / 0.5]]
+        if view.effect.per_channel:
+            runs = [[*runs[0], a["light_diffuse"][k : k + 1]] for k in range(3)]
+        tensor = np.stack([np.concatenate(planes) for planes in runs])
+        answer = graph.run(None, {"gbuffer": tensor})[0][:, 0]
+        factor = 1 / np.percentile(view.reference, 99) if view.effect.is_light else 1.0
+        reference = np.clip(view.reference * factor, 0, 1)
+        expected.append(metrics.dssim(np.clip(answer * factor, 0, 1), reference))
+        trivial.append(metrics.dssim(np.full_like(reference, view.effect.trivial), reference))
+    assert row["each"] == pytest.approx(expected, abs=1e-4)
+    assert error["trivial_dssim"] == pytest.approx(np.mean(trivial), rel=1e-4)
+
+
+def test_a_network_takes_any_size(root: Path) -> None:
+    bundle = Bundle.load(root / "models" / root.name / "fast")
+    whole = load_views(root / "data", root.name, 3)[2]
+    engine = load_engine(bundle, REFERENCE, threads=1)
+    answers = []
+    for view in (whole, resized(whole, 37, 53)):
+        method = Network(bundle, engine, "fast")
+        method.prepare(view)
+        answers.append(method.shade(view))
+    assert answers[1].shape == (len(bundle.outputs), 37, 53)
+    inner = np.s_[:, :35, :51]  # the convolutions see two pixels farther
+    assert np.allclose(answers[0][inner], answers[1][inner], rtol=1e-5)
+
+
+def test_nothing_to_measure_is_an_error(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds no bundle"):
+        run(*arguments(root, f"--models={tmp_path}"))
+    with pytest.raises(DataError, match="manifest"):
+        run(*arguments(root, f"--data={tmp_path}"))
+    with pytest.raises(ConfigError, match="no section is called 'sped'"):
+        run(*arguments(root, "--only", "sped"))
+    with pytest.raises(ConfigError, match="no effect is called 'oa'"):
+        run(*arguments(root, "--effect", "oa"))
+    assert not (tmp_path / "report.json").exists()
+
+
+def test_bodies_hold_the_view_at_any_size_and_compress_like_real_ones(root: Path) -> None:
+    view = load_views(root / "data", root.name, 3)[2]
+    large = resized(view, 300, 400)
+    position = large.attributes["position"]
+    assert np.array_equal(position[:, :SIZE, :SIZE], view.attributes["position"])
+    mirrored = view.attributes["position"][:, :, ::-1]
+    assert np.array_equal(position[:, :SIZE, SIZE : 2 * SIZE], mirrored)
+    grained = body(view, 300, 400, grain=True)
+    image = exr.read(grained).pixels
+    for axis, plane in zip("XYZ", position, strict=True):
+        assert np.allclose(image[f"position.{axis}"], plane, rtol=4e-3, atol=1e-6)
+    assert len(grained) > 2 * len(body(view, 300, 400))
+
+
+def made_up() -> dict[str, Any]:
+    """Sections with the networks on two backends, and a method at two settings."""
+    found = [
+        ("fast", "network", {"engine": "openvino", "precision": "bf16"}, 5.0, 0.04),
+        ("fast", "network", {"engine": "onnxruntime", "precision": "fp32"}, 10.0, 0.039),
+        ("paper", "paper's network", {"engine": "openvino", "precision": "bf16"}, 40.0, 0.06),
+        ("paper", "paper's network", {"engine": "onnxruntime", "precision": "fp32"}, 80.0, 0.06),
+        ("<HBAO>", "screen-space", {"steps": 2}, 7.0, 0.09),
+        ("<HBAO>", "screen-space", {"steps": 8}, 20.0, 0.07),
+    ]
+    rows = [
+        {"id": f"{name} {list(s.values())}", "name": name, "family": f, "settings": s, "ms": ms}
+        for name, f, s, ms, _ in found
+    ]
+    errors = [
+        row | {"dssim": error, "of_trivial": error / 0.1, "each": [error]}
+        for row, (*_, error) in zip(rows, found, strict=True)
+    ]
+    speeds = [
+        row | {"ms": {"median": row["ms"], "quartiles": [1.0, 99.0]}, "ms_per_megapixel": row["ms"]}
+        for row in rows
+    ]
+    facts = {"missing": {}, "views": 1, "size": [64, 64], "trivial_dssim": 0.1}
+    return {
+        "error": {"status": "done", "data": {"rows": errors, **facts}},
+        "speed": {"status": "done", "data": {"rows": speeds}},
+        "service": {"status": "skipped", "reason": "<no> port"},
+    }
+
+
+def test_like_is_compared_with_like() -> None:
+    table = {row["name"]: row for row in summary(made_up())}
+    assert table["fast"]["backend"] == "openvino/bf16"
+    assert table["fast"]["like_for_like"] == pytest.approx(8)  # and not 16, of two engines
+    assert table["fast"]["less_error"] == pytest.approx(1 / 3)
+    assert table["the paper's network"]["backend"] == "onnxruntime/fp32"
+    best = same_time(made_up())[-1]["reached"]
+    assert best["<HBAO>"]["dssim"] == 0.07
+    assert same_time(made_up())[0]["reached"]["<HBAO>"] is None
+
+
+def test_the_frontier_is_what_nothing_beats() -> None:
+    rng = np.random.default_rng(3)
+    found = [Point(str(k), "", "", *rng.integers(1, 9, 2)) for k in range(60)]
+    kept = frontier(found)
+    for point in found:
+        beaten = any(
+            (o.cost <= point.cost and o.error < point.error)
+            or (o.cost < point.cost and o.error <= point.error)
+            for o in found
+        )
+        alike = [(p.cost, p.error) for p in kept].count((point.cost, point.error))
+        assert alike == (0 if beaten else 1)
+
+
+def test_the_page_stands_alone_and_escapes_what_was_measured(tmp_path: Path) -> None:
+    context = Context(tmp_path, tmp_path, tmp_path, threads=2)
+    document = report.document(context, made_up(), "key", 12.0)
+    with plots.themed():
+        drawn = plots.speed_error(document["sections"], "ao")
+        assert drawn is not None
+        text = page.render(document, {"speed-error": plots.png(drawn)})
+    assert "&lt;HBAO&gt;" in text
+    assert "<HBAO>" not in text
+    assert "Skipped: &lt;no&gt; port" in text
+    assert not re.findall(r"""(?:src|href)=["'](?!#|data:)""", text)
+    assert text.count("data:image/png;base64,") == 1
+    assert points(document["sections"])
+
+
+@pytest.mark.parametrize("problem", [Skipped("no GPU"), DataError("no GPU"), OSError("no GPU")])
+def test_sections_are_kept_and_what_breaks_keeps_what_is_done(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, problem: Exception
+) -> None:
+    calls: list[str] = []
+
+    def measuring(name: str) -> Any:
+        def measure(context: Context) -> dict[str, Any]:
+            calls.append(name)
+            if name == "sizes":
+                raise problem
+            if name == "comparison":
+                raise KeyboardInterrupt
+            return dict(made_up()[name]["data"]) if name != "service" else {"rows": []}
+
+        return measure
+
+    sections = {name: (measuring(name), 1) for name in report.SECTIONS}
+    monkeypatch.setattr(report, "SECTIONS", sections)
+    monkeypatch.setattr(plots, "PLOTS", {})  # to draw takes long
+    context = Context(root / "models", root / "data", tmp_path, effect=root.name, quick=True)
+    with pytest.raises(KeyboardInterrupt):
+        report.measure(context)
+    found = json.loads((tmp_path / "report.json").read_text())["sections"]
+    assert list(found) == ["error", "speed", "service", "sizes"]
+    assert found["sizes"] == {"status": "skipped", "reason": "no GPU"}
+    calls.clear()
+    seen: list[tuple[str, float]] = []
+    with pytest.raises(KeyboardInterrupt):
+        report.measure(
+            context, resume=True, progress=lambda name, share, _: seen.append((name, share))
+        )
+    assert calls == ["sizes", "comparison"]
+    assert seen[:2] == [("sizes", 0.0), ("sizes", 1.0)]
+    assert list(report.measure(context, only=["speed"])["sections"]) == list(found)
+    other = dataclasses.replace(context, threads=context.threads + 1)
+    assert list(report.measure(other, only=["speed"])["sections"]) == ["speed"]
