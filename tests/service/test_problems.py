@@ -257,7 +257,7 @@ def test_full_queue_is_429_and_the_loop_stays_free(start, make_exr, wait_until):
 def alive(local):
     """Bytes of the uploads that the process still has."""
     gc.collect()
-    return sum(len(each.data) for each in gc.get_objects() if isinstance(each, Upload))
+    return sum(len(each.data) for each in gc.get_objects() if type(each) is Upload)
 
 
 def send(local, body):
