@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager, suppress
@@ -17,21 +16,22 @@ from fastapi.responses import HTMLResponse, PlainTextResponse
 from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
+from deepshade.engines import Engine
+from deepshade.errors import EngineError
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade_service import problems
-from deepshade_service.candidate import Candidate
-from deepshade_service.choice import Choices
 from deepshade_service.config import Settings
-from deepshade_service.job import Answer, Job
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, not_ready
 from deepshade_service.parameters import ShadeParameters
-from deepshade_service.pool import Cancelled, Workers
+from deepshade_service.selection import allowed
+from deepshade_service.shading import Shaded, Shader
 from deepshade_service.telemetry import MEDIA_TYPE as METRICS_TYPE
 from deepshade_service.telemetry import Telemetry
 from deepshade_service.uploads import Uploads
+from deepshade_service.workers import Cancelled, Workers
 
 
 class Service:
@@ -39,57 +39,40 @@ class Service:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self.models = Models(
-            settings.models, threads=settings.threads, calibration=settings.calibration
-        )
+        pinned = settings.engine, settings.precision
+        self.models = Models(settings.models, threads=settings.threads, pinned=pinned)
         self.workers = Workers(settings.workers, settings.queue)
         self.uploads = Uploads(settings)
         self.memory = MemoryBudget(settings.memory)
+        self.shader = Shader(self.models, self.workers, self.memory, settings.limits)
         self.telemetry = Telemetry(
             queued=lambda: self.workers.taken, held=lambda: self.uploads.held
         )
 
     @asynccontextmanager
     async def running(self, app: FastAPI) -> AsyncIterator[None]:
-        """Load models in the background, so that /healthz answers meanwhile; stop in the end.
-
-        Once they are loaded the machine is calibrated, in the background too.
-        """
-        stopping = threading.Event()
-
-        def prepare() -> None:
-            self.models.load()
-            self.models.calibrate(stopping)
-
-        tasks = [
-            asyncio.create_task(asyncio.to_thread(prepare)),
-            asyncio.create_task(self._tidy()),
-        ]
+        """Verify bundles in the background, so that /healthz answers meanwhile; stop in the end."""
+        tasks = [asyncio.create_task(self.models.load()), asyncio.create_task(self._tidy())]
         try:
             yield
         finally:
-            stopping.set()
             for task in tasks:
                 task.cancel()
-            await asyncio.to_thread(self.workers.stop)
+            await self.workers.stop()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def shade(self, effect: str, request: Request, asked: ShadeParameters) -> Answer:
+    async def shade(self, effect: str, request: Request, asked: ShadeParameters) -> Shaded:
         """Receive, queue and shade one picture."""
-        choices = Choices.of(self.models, effect, asked)
-        self.workers.check_room()  # before the body is received, to spare both sides the work
-        async with self.uploads.receive(request) as uploads:
-            job = Job(choices, self.models.engine, uploads, self.settings.limits, self.memory)
-            answer = await _unless_gone(request, self.workers.run(job))
+        candidates = allowed(self.models, effect, asked)
+        self.workers.check_place()  # before the body is received, to spare both sides the work
+        async with self.uploads.receive(request) as files:
+            with self.workers.place():
+                work = self.shader.shade(files, asked, candidates)
+                shaded = await _unless_gone(request, work)
         if not asked.explain:
-            self.telemetry.shaded(
-                effect,
-                answer.watch,
-                answer.pixels,
-                answer.computed,
-                int(answer.facts["nonfinite_pixels"]),
-            )
-        return answer
+            nonfinite = int(shaded.facts["nonfinite_pixels"])
+            self.telemetry.shaded(effect, shaded.watch, shaded.pixels, shaded.computed, nonfinite)
+        return shaded
 
     async def _tidy(self) -> None:
         """Give memory back when nothing has been shaded for a while."""
@@ -100,12 +83,7 @@ class Service:
             idle = time.monotonic() - ended
             if ended > tidied and not self.workers.taken and idle > self.settings.idle_trim:
                 tidied = time.monotonic()
-                await asyncio.to_thread(self._release)
-
-    def _release(self) -> None:
-        for engine in self.models:
-            engine.shrink()
-        trim()
+                await asyncio.to_thread(_release, self.models.engines())
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -160,18 +138,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def healthz() -> dict[str, str]:
         return {"status": "ok"}
 
-    @app.get("/readyz", tags=["operation"], summary="Are the models loaded and warm?")
+    @app.get("/readyz", tags=["operation"], summary="Are the bundles verified?")
     async def readyz() -> dict[str, Any]:
         if not service.models.ready:
             raise not_ready(service.models)
         models = service.models
         bundles = [f"{name}/{bundle.name}" for name in EFFECTS for bundle in models.bundles(name)]
-        return {
-            "status": "ready",
-            "bundles": bundles,
-            "refused": models.refused,
-            "calibrating": models.calibrating,
-        }
+        return {"status": "ready", "bundles": bundles, "refused": models.refused}
 
     @app.get("/metrics", tags=["operation"], summary="Counters, for Prometheus")
     async def metrics() -> Response:
@@ -186,7 +159,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
-async def _unless_gone(request: Request, work: Awaitable[Answer]) -> Answer:
+def _release(engines: list[Engine]) -> None:
+    for engine in engines:
+        engine.shrink()
+    trim()
+
+
+async def _unless_gone(request: Request, work: Awaitable[Shaded]) -> Shaded:
     """The work's result; if the client disconnects first the work is cancelled."""
     job = asyncio.ensure_future(work)
     gone = asyncio.ensure_future(_gone(request))
@@ -209,26 +188,30 @@ async def _gone(request: Request) -> None:
 
 def _effect(name: str, models: Models) -> dict[str, Any]:
     effect = EFFECTS[name]
-    bundles = models.bundles(name)
-    candidates = models.candidates(name) if bundles else []
     return {
         "name": name,
         "title": effect.title,
         "inputs": [
-            {"attribute": i, "channels": ATTRIBUTES[i].channels, "meaning": ATTRIBUTES[i].meaning}
+            {
+                "attribute": i,
+                "channels": ATTRIBUTES[i].channels,
+                "unit": ATTRIBUTES[i].unit.name,
+                "meaning": ATTRIBUTES[i].meaning,
+            }
             for i in effect.inputs
         ],
         "outputs": effect.outputs,
         "reference": effect.reference,
-        "bundles": [
-            _bundle(bundle, [c for c in candidates if c.bundle.name == bundle.name])
-            for bundle in bundles
-        ],
+        "background": effect.background,
+        "settings": effect.settings,
+        "bundles": [_bundle(bundle, models) for bundle in models.bundles(name)],
     }
 
 
-def _bundle(bundle: Bundle, candidates: list[Candidate]) -> dict[str, Any]:
-    default = next(candidate for candidate in candidates if candidate.default)
+def _bundle(bundle: Bundle, models: Models) -> dict[str, Any]:
+    backend = None
+    with suppress(EngineError):  # pinned by the operator, and not for this bundle
+        backend = models.backend(bundle)
     return {
         "name": bundle.name,
         "sha256": bundle.sha256,
@@ -236,23 +219,9 @@ def _bundle(bundle: Bundle, candidates: list[Candidate]) -> dict[str, Any]:
         "radius": bundle.radius,
         "size_multiple": bundle.size_multiple,
         "halo": bundle.halo,
-        "background_halo": bundle.background_halo,
-        "engine": default.backend.engine,
-        "precision": default.backend.precision,
-        "dssim": default.dssim,
-        "backends": [
-            {
-                "engine": candidate.backend.engine,
-                "precision": candidate.backend.precision,
-                "dssim": candidate.dssim,
-                "added": candidate.added,
-                "fixed_ms": candidate.fixed_ms,
-                "ms_per_megapixel": candidate.ms_per_megapixel,
-                "calibrated": candidate.calibrated,
-                "default": candidate.default,
-            }
-            for candidate in candidates
-        ],
+        "engine": backend and backend.engine,
+        "precision": backend and backend.precision,
+        "dssim": bundle.dssim,
         "metrics": bundle.metrics,
     }
 
@@ -313,6 +282,7 @@ _SHADE_RESPONSES |= {
         415: "Another content type than EXR or a form",
         422: "A missing attribute or a bad parameter",
         429: "The queue is full; see Retry-After",
-        503: "The models aren't loaded yet",
+        500: "A bundle that can't be loaded, or a failure inside",
+        503: "The bundles aren't verified yet",
     }.items()
 }

@@ -34,14 +34,13 @@ def serve(
             " the models that came with the sources."
         ),
     ] = None,
-    calibration: Annotated[
-        str,
-        typer.Option(
-            help="File with what each engine and precision takes and costs here, measured in the"
-            " background where it says nothing; 'off' measures nothing and stays in fp32."
-            " Default: calibration.json in $XDG_CACHE_HOME/deepshade."
-        ),
-    ] = "",
+    engine: Annotated[
+        str | None,
+        typer.Option(help="What networks run on, as onnxruntime. Default: the first there is."),
+    ] = None,
+    precision: Annotated[
+        str | None, typer.Option(help="How they calculate, as fp32. Default: as the CPU does best.")
+    ] = None,
     threads: Annotated[
         int | None, typer.Option(min=1, help="Of a network run. Default: the CPUs we may use.")
     ] = None,
@@ -74,38 +73,39 @@ def serve(
 
     from deepshade.bundles import bundle_root
     from deepshade.errors import ConfigError
-    from deepshade_service.calibration import chosen_path
-    from deepshade_service.config import Settings, default_limits
+    from deepshade.machine import cpu_count
+    from deepshade_service.config import Settings, default_limits, default_memory
     from deepshade_service.memory import parse_size
+    from deepshade_service.models import check_backend
 
     models = models or bundle_root()
     if not models.is_dir():
         raise ConfigError(
             "models", detail=f"there is no folder {models}; --models says where the bundles are"
         )
-    limits = {
-        "body_bytes": parse_size(max_body) if max_body else None,
-        "decoded_bytes": parse_size(max_decoded) if max_decoded else None,
+    if engine or precision:
+        check_backend(engine, precision)  # said now, and not by every answer
+    given = {
+        "body_bytes": max_body and parse_size(max_body),
+        "decoded_bytes": max_decoded and parse_size(max_decoded),
         "pixels": max_pixels,
         "parts": max_parts,
         "channels": max_channels,
     }
     uploads = parse_size(max_uploads) if max_uploads else 0
-    chosen = {"threads": threads, "memory": parse_size(memory) if memory else None}
     settings = Settings(
         models=models,
-        calibration=chosen_path(calibration),
-        limits=replace(
-            default_limits(uploads),
-            **{name: value for name, value in limits.items() if value is not None},
-        ),
+        engine=engine,
+        precision=precision,
+        limits=replace(default_limits(uploads), **{k: v for k, v in given.items() if v}),
+        threads=threads or cpu_count(),
+        memory=parse_size(memory) if memory else default_memory(),
         uploads=uploads,
         files=max_files,
         workers=workers,
         queue=queue,
         body_timeout=body_timeout,
         grace=grace,
-        **{name: value for name, value in chosen.items() if value is not None},
     )
     with listen(host, port) as listener:
         _run(settings, listener, log_level)

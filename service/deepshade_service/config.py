@@ -37,12 +37,13 @@ class Settings:
     `memory` is what all requests together may use for pixels and networks, above the idle
     service; tiles are cut to fit. `uploads` bounds, besides, the bodies held while they arrive
     (twice their bytes) and wait; 0 is the default for this machine, or what the largest body needs.
-    `calibration` is the file with what each backend takes and costs here; without one (None)
-    nothing is measured, and everything runs in fp32 unless a request pins another precision.
+    `engine` and `precision` pin what requests run on that pin nothing themselves; None leaves it
+    to the rule (`deepshade.engines.choose`).
     """
 
     models: Path = field(default_factory=bundle_root)
-    calibration: Path | None = None
+    engine: str | None = None
+    precision: str | None = None
     limits: Limits = field(default_factory=default_limits)
     threads: int = field(default_factory=cpu_count)
     workers: int = 3  # of two, both sometimes wait for a lock, and a CPU is idle

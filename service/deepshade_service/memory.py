@@ -1,15 +1,33 @@
-"""Memory: how much is in use, sharing it between requests, and giving it back."""
+"""Memory: what a picture takes, and a budget that requests share, first come, first served."""
 
 from __future__ import annotations
 
+import asyncio
 import re
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from math import prod
 
-from deepshade.errors import ConfigError
+from deepshade import exr
+from deepshade.bundles import Bundle
+from deepshade.effects import EFFECTS
+from deepshade.errors import ConfigError, LimitError
+from deepshade.tensors import channel_count
+from deepshade.threads import thread_count
+from deepshade_service.tiles import min_tile, padded
 
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+
+# What one request may take of the memory, so that small ones still run beside a big one.
+_SHARE = 0.75
+# A picture gets by with so much, or with so many times what it holds anyway. Larger tiles spare
+# overlap, but that soon costs more memory than it is worth.
+_USUAL = 7 * 2**27  # 7/8 GiB: a 3840 x 2160 answer stays below 1 GiB
+_TIMES = 1.5
+_MARKERS = 3  # channels that only mark the background: depth, distance, alpha
+_STRIP = 8 * 2**20  # what `exr` decodes at a time, unless the file's own pieces are larger
 
 
 def parse_size(text: str | int) -> int:
@@ -21,30 +39,87 @@ def parse_size(text: str | int) -> int:
 
 
 class MemoryBudget:
-    """Bytes that requests share; a request waits until its part is free, so the sum is bounded."""
+    """Bytes that requests share, so that their sum is bounded.
+
+    Who comes first is served first: a large request isn't passed by small ones for ever. Only
+    for use on the event loop.
+    """
 
     def __init__(self, total: int) -> None:
         self.total = total
         self._free = total
-        self._changed = threading.Condition()
+        self._waiting: deque[tuple[int, asyncio.Future[None]]] = deque()
 
-    @contextmanager
-    def hold(self, amount: int, cancelled: threading.Event | None = None) -> Iterator[None]:
-        """Hold `amount` bytes (at most the total); blocks, so call it from a worker thread.
-
-        Gives up waiting, without the memory, when `cancelled` is set: the caller must look at it.
-        """
+    @asynccontextmanager
+    async def hold(self, amount: int) -> AsyncIterator[None]:
+        """Hold `amount` bytes (at most the total) within the block; waits for them."""
         amount = min(amount, self.total)
-        with self._changed:
-            while self._free < amount:
-                if cancelled is not None and cancelled.is_set():
-                    amount = 0
-                    break
-                self._changed.wait(timeout=0.2)
-            self._free -= amount
+        turn = asyncio.get_running_loop().create_future()
+        self._waiting.append((amount, turn))
+        self._serve()
         try:
+            await turn
             yield
         finally:
-            with self._changed:
+            if turn.done() and not turn.cancelled():
                 self._free += amount
-                self._changed.notify_all()
+            self._serve()
+
+    def _serve(self) -> None:
+        while self._waiting:
+            amount, turn = self._waiting[0]
+            if not turn.cancelled():
+                if amount > self._free:
+                    return
+                self._free -= amount
+                turn.set_result(None)
+            self._waiting.popleft()
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """Bytes that a whole job takes, and the pixels that one prediction within it may have."""
+
+    total: int
+    max_pixels: int
+
+
+def need_of(headers: Sequence[exr.Header], bundle: Bundle, total: int) -> Need:
+    """What shading these files takes of `total` bytes, by their headers alone.
+
+    Raises LimitError when the total is too small even for the smallest tiles.
+    """
+    outputs = len(EFFECTS[bundle.effect].outputs)
+    channels = channel_count(bundle.inputs, per_channel=False)
+    height, width = size_of(headers)
+    # Throughout: the files, their channels as float32 with masks, the answer and its copies.
+    pixel = 4 * channels + 4 + 12 * outputs
+    held = sum(header.body_bytes for header in headers) + pixel * width * height
+    # First strips of all channels as they are stored and what marks the background, then what
+    # the inputs may be derived from, and after that, in the same room, the network.
+    sources = 4 * channels * width * height
+    decoded = max(sources, _decoding(headers) + 4 * _MARKERS * width * height)
+    # What a tile's pixel takes: within the engine, and as its input and output.
+    tile = bundle.bytes_per_pixel + 4 * (bundle.channels + outputs)
+    least = held + max(decoded, tile * min_tile(height, width, bundle.size_multiple, bundle.halo))
+    if least > total:
+        raise LimitError("memory_bytes", least, total)
+    most = max(int(min(_SHARE * total, max(_USUAL, _TIMES * held))), least)
+    pixels = min((most - held) // tile, prod(padded(height, width, bundle.size_multiple)))
+    return Need(held + max(decoded, tile * pixels), pixels)
+
+
+def size_of(headers: Sequence[exr.Header]) -> tuple[int, int]:
+    """(height, width) of the largest part: any may turn out to be the one that is shaded."""
+    return max((part.shape for header in headers for part in header.parts), key=prod)
+
+
+def _decoding(headers: Sequence[exr.Header]) -> int:
+    """Bytes that decoding takes beside what comes out: strips of all channels, on many threads."""
+    parts = [part for header in headers for part in header.parts]
+    largest = max(
+        part.decoded_bytes if part.subsampled else part.decoded_bytes // part.chunks.rows
+        for part in parts
+    )
+    strips = 2 * thread_count() * max(_STRIP, largest)
+    return min(strips, sum(part.decoded_bytes for part in parts))

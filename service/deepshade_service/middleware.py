@@ -10,7 +10,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from deepshade_service.telemetry import Telemetry
 
 # A refused body is thrown away for so long, in seconds, before its connection is closed.
-_LINGER = 1.0
+_MAX_LINGER = 1.0
 
 
 class Counting:
@@ -26,20 +26,23 @@ class Counting:
             await self._app(scope, receive, send)
             return
 
-        def count(status: int) -> None:
-            # The route's pattern, not the path: strangers could make up endless labels.
-            self._telemetry.answered(getattr(scope.get("route"), "path", "other"), status)
+        status = 0
 
-        async def counted(message: Message) -> None:
+        async def seen(message: Message) -> None:
+            nonlocal status
             if message["type"] == "http.response.start":
-                count(message["status"])
+                status = message["status"]
             await send(message)
 
         try:
-            await self._app(scope, receive, counted)
+            await self._app(scope, receive, seen)
         except Exception:
-            count(500)  # answered further out
+            status = status or 500  # answered further out, unless an answer had begun
             raise
+        finally:
+            # The route's pattern, not the path: strangers could make up endless labels.
+            if status:
+                self._telemetry.answered(getattr(scope.get("route"), "path", "other"), status)
 
 
 class Closing:
@@ -84,7 +87,7 @@ class Closing:
             elif refused and not message.get("more_body", False):
                 await send({**message, "more_body": True})
                 with suppress(TimeoutError):
-                    async with asyncio.timeout(_LINGER):
+                    async with asyncio.timeout(_MAX_LINGER):
                         await drain()
                 message = {"type": "http.response.body", "body": b"", "more_body": False}
             await send(message)

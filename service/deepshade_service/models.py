@@ -1,203 +1,81 @@
-"""The bundles that this service has, on what each can run, and the engines in memory."""
+"""The bundles that this service has, and the engines in memory."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
-import threading
 from collections import OrderedDict
-from collections.abc import Iterator
 from pathlib import Path
 
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS, Effect
-from deepshade.engines import Backend, Engine, load_engine
-from deepshade.errors import EngineError, nearest
-from deepshade_service.calibration import Calibration
-from deepshade_service.candidate import Candidate, candidates_of, speed
-from deepshade_service.measurement import published
+from deepshade.engines import Backend, Engine, available, choose, load_engine
+from deepshade.errors import DeepshadeError, EngineError, nearest
 from deepshade_service.problems import Problem
 
 log = logging.getLogger("deepshade.service")
 
-# Engines kept in memory beside each bundle's default: those that requests pinned.
-_PINNED = 4
+MAX_ENGINES = 8  # in memory; of others the one that was used longest ago goes
+
+Key = tuple[Path, Backend]
 
 
 class Models:
-    """Bundles by effect and name, and engines for them. `load` and `calibrate` block.
+    """Bundles by effect and name, and engines for them, each loaded when it is first asked for.
 
-    `calibration` is the file that keeps what was measured. Without one (None) every bundle runs
-    on the first of `available`, which is ONNX Runtime in fp32, unless a request pins another.
+    `pinned` is the engine and the precision of every request that pins nothing itself. Only for
+    use on the event loop; what blocks is done in threads.
     """
 
-    def __init__(self, root: Path, *, threads: int, calibration: Path | None = None) -> None:
+    def __init__(
+        self, root: Path, *, threads: int, pinned: tuple[str | None, str | None] = (None, None)
+    ) -> None:
         self.root = root
         self.ready = False
-        self.calibrating = False
         self.refused: list[str] = []
-        self.calibration = (
-            None if calibration is None else Calibration(calibration, threads=threads)
-        )
         self._threads = threads
+        self._pinned = pinned
         self._bundles: dict[str, dict[str, Bundle]] = {}
-        self._engines: OrderedDict[tuple[Path, Backend], Engine] = OrderedDict()
-        self._loading: dict[tuple[Path, Backend], threading.Lock] = {}
-        self._lock = threading.Lock()
-        self._known: dict[Path, tuple[int, list[Candidate]]] = {}
+        self._engines: OrderedDict[Key, Engine] = OrderedDict()
+        self._loading: dict[Key, asyncio.Task[Engine]] = {}
+        self._speeds: dict[Key, float] = {}
 
-    def load(self) -> None:
-        """Verify every bundle and warm its default; what can't be used is left out, loudly."""
-        self.calibrating = self.calibration is not None
+    async def load(self) -> None:
+        """Verify every bundle; what can't be used is left out, loudly. Loads no engine."""
+        if not await asyncio.to_thread(available):
+            log.error("the service stays unready: no engine is installed")
+            return
+        found: dict[str, dict[str, Bundle]] = {}
         for folder in bundle_folders(self.root):
-            self._load_one(folder)
-        self.ready = bool(self._bundles)
-        if not self.ready:
-            self.calibrating = False
+            label = f"{folder.parent.name}/{folder.name}"
+            try:
+                bundle = await asyncio.to_thread(Bundle.load, folder)
+            except (DeepshadeError, OSError) as error:
+                self.refused.append(label)
+                log.error("bundle %s is refused: %s", label, error)
+                continue
+            found.setdefault(bundle.effect, {})[bundle.name] = bundle
+            log.info("bundle %s (%s) is verified", label, bundle.short_hash)
+        self._bundles = found
+        self.ready = bool(found)
+        if not found:
             log.error("no usable bundle under %s: the service stays unready", self.root)
 
-    def _load_one(self, path: Path) -> None:
-        label = f"{path.parent.name}/{path.name}"
-        try:
-            bundle = Bundle.load(path)
-            engine = self.engine(self._default(bundle))
-        except Exception as error:
-            # Also what the libraries raise: one bad bundle must not take the others down.
-            self.refused.append(label)
-            log.error("bundle %s is refused: %s", label, error)
-            return
-        self._bundles.setdefault(bundle.effect, {})[bundle.name] = bundle
-        log.info(
-            "bundle %s (%s) is loaded on %s, %d bytes a pixel",
-            label,
-            bundle.short_hash,
-            engine.backend,
-            engine.bytes_per_pixel,
-        )
-
-    def calibrate(self, cancelled: threading.Event) -> None:
-        """Measure what this machine hasn't measured yet, and warm what turns out as default.
-
-        Ends soon after `cancelled` is set. Until a bundle is measured it runs in fp32.
-        """
-        try:
-            if self.calibration is None:
-                return
-            for bundle in [b for named in self._bundles.values() for b in named.values()]:
-                missing = self.calibration.missing(bundle)
-                if not missing or cancelled.is_set():
-                    continue
-                log.info("measuring %s/%s on this machine", bundle.effect, bundle.name)
-                self.calibration.measure(bundle, missing, cancelled)
-                chosen = self._default(bundle)
-                self.engine(chosen)
-                log.info("%s/%s runs on %s", bundle.effect, bundle.name, chosen.backend)
-        finally:
-            self.calibrating = False
-            self._drop()
-
-    def __iter__(self) -> Iterator[Engine]:
-        """The engines in memory."""
-        with self._lock:
-            return iter(list(self._engines.values()))
-
     def bundles(self, effect: str) -> list[Bundle]:
-        """The bundles of one effect, the one with the least error first."""
+        """The bundles of one effect, the one with the least error first; [] while loading."""
         return sorted(self._bundles.get(effect, {}).values(), key=_error)
 
-    def candidates(self, effect: str) -> list[Candidate]:
-        """Every bundle on every backend it can run on: by the bundle's error, its default first.
+    def find(self, effect: str, name: str | None = None) -> list[Bundle]:
+        """The bundles of one effect, by error, or the one of that name.
 
         Raises Problem 404 (unknown effect, no bundle) and 503 (not ready).
         """
-        self._check(effect)
-        return [one for bundle in self.bundles(effect) for one in self._of(bundle)]
-
-    def candidate(
-        self,
-        effect: str,
-        name: str | None = None,
-        engine: str | None = None,
-        precision: str | None = None,
-    ) -> Candidate:
-        """The best bundle or the one of that name, on its default or on what is pinned.
-
-        With one of `engine` and `precision` pinned it is the fastest of those left (the first
-        known, before any is measured). Raises Problem 404 (no such effect or bundle), 422 (no
-        such backend here) and 503 (not ready).
-        """
-        bundle = self._find(effect, name)
-        all_ = self._of(bundle)
-        fitting = [
-            one
-            for one in all_
-            if engine in (None, one.backend.engine) and precision in (None, one.backend.precision)
-        ]
-        if not fitting:
-            asked = "/".join(part or "*" for part in (engine, precision))
-            raise Problem(
-                422,
-                "no-backend",
-                f"the bundle '{bundle.name}' can't run on {asked[:100]} here",
-                fix="choose one of `available`, or leave out ?engine= and ?precision=",
-                available=[str(one.backend) for one in all_],
-            )
-        defaults = [one for one in fitting if one.default]
-        return defaults[0] if defaults else min(fitting, key=speed)
-
-    def engine(self, candidate: Candidate) -> Engine:
-        """The candidate's engine, warm; blocks while it is loaded.
-
-        Raises EngineError, which `usable` backends only do when a library refuses the graph.
-        """
-        key = candidate.bundle.path, candidate.backend
-        with self._lock:
-            if key in self._engines:
-                self._engines.move_to_end(key)
-                return self._engines[key]
-            loading = self._loading.setdefault(key, threading.Lock())
-        with loading:
-            with self._lock:
-                if key in self._engines:
-                    return self._engines[key]
-            engine = load_engine(candidate.bundle, candidate.backend, threads=self._threads)
-            engine.warm()
-            with self._lock:
-                self._engines[key] = engine
-        self._drop()
-        return engine
-
-    def _drop(self) -> None:
-        """Forget the engines that were pinned longest ago; defaults stay."""
-        bundles = [b for named in self._bundles.values() for b in named.values()]
-        kept = {(bundle.path, self._default(bundle).backend) for bundle in bundles}
-        with self._lock:
-            others = [key for key in self._engines if key not in kept]
-            for key in others[: max(0, len(others) - _PINNED)]:
-                del self._engines[key]
-
-    def _of(self, bundle: Bundle) -> list[Candidate]:
-        """A bundle's candidates, its default first."""
-        revision = -1 if self.calibration is None else self.calibration.revision
-        made, candidates = self._known.get(bundle.path, (None, []))
-        if made != revision:
-            candidates = candidates_of(bundle, self.calibration)
-            self._known[bundle.path] = revision, candidates
-        return candidates
-
-    def _default(self, bundle: Bundle) -> Candidate:
-        candidates = self._of(bundle)
-        if not candidates:
-            raise EngineError(
-                "no engine is installed", fix="pip install 'deepshade[service]', then restart"
-            )
-        return candidates[0]
-
-    def _check(self, effect: str) -> dict[str, Bundle]:
         find_effect(effect)
         if not self.ready:
             raise not_ready(self)
-        named = self._bundles.get(effect, {})
-        if not named:
+        bundles = self.bundles(effect)
+        names = [bundle.name for bundle in bundles]
+        if not bundles:
             raise Problem(
                 404,
                 "no-bundle",
@@ -205,28 +83,90 @@ class Models:
                 fix=f"put one into the service's models folder as {effect}/<name>/, and restart",
                 installed=sorted(self._bundles),
             )
-        return named
-
-    def _find(self, effect: str, name: str | None) -> Bundle:
-        named = self._check(effect)
-        if name is None:
-            return self.bundles(effect)[0]
-        if name not in named:
-            close = nearest(name, named)
+        if name is not None and name not in names:
+            close = nearest(name, names)
             raise Problem(
                 404,
                 "no-bundle",
                 f"the effect '{effect}' has no bundle '{name[:100]}' here",
                 fix=f"did you mean '{close}'?" if close else "leave out ?bundle=",
-                installed=sorted(named),
+                installed=sorted(names),
             )
-        return named[name]
+        return [bundle for bundle in bundles if name in (None, bundle.name)]
+
+    def backend(
+        self, bundle: Bundle, engine: str | None = None, precision: str | None = None
+    ) -> Backend:
+        """What a request with these pins runs on, by rule. Raises EngineError if it isn't here."""
+        pins = (engine, precision) if engine or precision else self._pinned
+        return choose(bundle, *pins)
+
+    async def engine(self, bundle: Bundle, backend: Backend) -> Engine:
+        """The bundle's engine, warm. Who asks while it is loaded waits for that one.
+
+        Raises Problem 500 when a library refuses the graph.
+        """
+        key = bundle.path, backend
+        if key in self._engines:
+            self._engines.move_to_end(key)
+            return self._engines[key]
+        if key not in self._loading:
+            self._loading[key] = asyncio.create_task(self._load(key, bundle))
+        return await asyncio.shield(self._loading[key])
+
+    async def ms_per_megapixel(self, bundle: Bundle, backend: Backend) -> float:
+        """What the network takes, as timed when its engine was first loaded: never anew, so that
+        the same request gets the same bundle."""
+        if (bundle.path, backend) not in self._speeds:
+            await self.engine(bundle, backend)
+        return self._speeds[bundle.path, backend]
+
+    def engines(self) -> list[Engine]:
+        """Those in memory."""
+        return list(self._engines.values())
+
+    async def _load(self, key: Key, bundle: Bundle) -> Engine:
+        label = f"{bundle.effect}/{bundle.name}"
+        try:
+            engine = await asyncio.to_thread(self._warmed, bundle, key[1])
+        except Exception as error:  # libraries raise what they like
+            log.exception("bundle %s can't be loaded on %s", label, key[1])
+            raise Problem(
+                500,
+                "bad-bundle",
+                f"the bundle '{label}' can't be loaded on {key[1]}; the service's log says why",
+                fix="choose another ?bundle= or ?engine=, or export the bundle again",
+            ) from error
+        finally:
+            del self._loading[key]
+        log.info("bundle %s is loaded on %s", label, key[1])
+        self._speeds.setdefault(key, engine.ms_per_megapixel * (3 if bundle.per_channel else 1))
+        self._engines[key] = engine
+        if len(self._engines) > MAX_ENGINES:
+            self._engines.popitem(last=False)
+        return engine
+
+    def _warmed(self, bundle: Bundle, backend: Backend) -> Engine:
+        engine = load_engine(bundle, backend, threads=self._threads)
+        engine.warm()
+        return engine
 
 
 def _error(bundle: Bundle) -> tuple[float, str]:
     """Known errors first; then by name."""
-    error = published(bundle)
-    return (float("inf") if error is None else error), bundle.name
+    return (float("inf") if bundle.dssim is None else bundle.dssim), bundle.name
+
+
+def check_backend(engine: str | None, precision: str | None) -> None:
+    """Raises EngineError when nothing on this machine is as asked."""
+    asked = [("engine", engine), ("precision", precision)]
+    for backend in available():
+        if all(value in (None, getattr(backend, name)) for name, value in asked):
+            return
+    raise EngineError(
+        f"no '{engine or '*'}/{precision or '*'}' on this machine",
+        fix=f"one of: {', '.join(map(str, available()))}",
+    )
 
 
 def find_effect(name: str) -> Effect:
@@ -248,7 +188,7 @@ def not_ready(models: Models) -> Problem:
     return Problem(
         503,
         "not-ready",
-        "the service isn't ready: its models are still loading, or there are none",
+        "the service isn't ready: its bundles are still being verified, or there are none",
         headers={"Retry-After": "2"},
         refused=sorted(models.refused),
     )

@@ -6,17 +6,30 @@ from enum import StrEnum
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic.fields import FieldInfo
 
+from deepshade.effects import SETTINGS, Effect
 from deepshade.errors import ConfigError
 from deepshade.exr import COMPRESSIONS
 from deepshade.gbuffer.channels import parse_mapping
 from deepshade.gbuffer.profiles import PROFILES
+from deepshade_service.problems import Problem
 
-# Far beyond any scene, and safely inside what float32 can divide by.
-MIN_RADIUS, MAX_RADIUS = 1e-30, 1e30
+LENS = ("focus", "aperture")  # settings from which the blur circle is derived
 
 Compression = StrEnum("Compression", {name: name for name in COMPRESSIONS})  # type: ignore[misc]
 Profile = StrEnum("Profile", {name: name for name in PROFILES})  # type: ignore[misc]
+
+
+def _setting(name: str, instead: str = "") -> FieldInfo:
+    setting = SETTINGS[name]
+    return Field(  # type: ignore[no-any-return]
+        ge=setting.lowest,
+        le=setting.highest,
+        allow_inf_nan=False,
+        description=f"{setting.meaning.capitalize()}, in {setting.unit}. Without it, what the"
+        f" header's `{setting.header}` says{instead}.",
+    )
 
 
 class ShadeParameters(BaseModel):
@@ -24,16 +37,9 @@ class ShadeParameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    radius: Annotated[
-        float | None,
-        Field(
-            ge=MIN_RADIUS,
-            le=MAX_RADIUS,
-            allow_inf_nan=False,
-            description="The effect's radius in scene units. Else the header's `deepshade:radius`,"
-            " else the bundle's own.",
-        ),
-    ] = None
+    radius: Annotated[float | None, _setting("radius", ", else the bundle's own")] = None
+    focus: Annotated[float | None, _setting("focus")] = None
+    aperture: Annotated[float | None, _setting("aperture")] = None
     fov: Annotated[
         float | None,
         Field(
@@ -53,7 +59,7 @@ class ShadeParameters(BaseModel):
     ] = []
     bundle: Annotated[
         str | None,
-        Field(description="Which of the effect's bundles; else `balanced`, else the most exact."),
+        Field(description="Which of the effect's bundles; else `balanced`, else the least error."),
     ] = None
     quality: Annotated[
         Literal["fast", "balanced", "best"] | None,
@@ -65,8 +71,8 @@ class ShadeParameters(BaseModel):
             gt=0,
             le=1,
             allow_inf_nan=False,
-            description="The largest error (DSSIM, as measured on held-out views): the fastest"
-            " bundle and precision within it.",
+            description="The largest error (DSSIM, as published with the bundle): the fastest"
+            " bundle within it.",
         ),
     ] = None
     budget_ms: Annotated[
@@ -74,8 +80,8 @@ class ShadeParameters(BaseModel):
         Field(
             gt=0,
             allow_inf_nan=False,
-            description="Milliseconds that the network may take, by this machine's calibration:"
-            " the most accurate bundle and precision within it.",
+            description="Milliseconds that the network may take, by what it took while it was"
+            " loaded: the most accurate bundle within it.",
         ),
     ] = None
     engine: Annotated[
@@ -83,7 +89,7 @@ class ShadeParameters(BaseModel):
         Field(description="What the network must run on, as `onnxruntime` or `openvino`."),
     ] = None
     precision: Annotated[
-        Literal["fp32", "bf16", "fp16", "int8"] | None,
+        Literal["fp32", "bf16", "int8"] | None,
         Field(description="How exactly it must calculate."),
     ] = None
     explain: Annotated[
@@ -113,3 +119,14 @@ class ShadeParameters(BaseModel):
     def mapping(self) -> dict[str, str]:
         """`map` as attribute -> channel or layer."""
         return parse_mapping(self.map)
+
+    def check(self, effect: Effect) -> None:
+        """Raises Problem 422 for a setting that the effect doesn't have."""
+        for name in ("radius", *LENS):
+            if getattr(self, name) is not None and name not in effect.settings:
+                raise Problem(
+                    422,
+                    "bad-parameter",
+                    f"the effect '{effect.name}' has no setting '{name}'",
+                    fix=f"leave out ?{name}=",
+                )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -11,8 +12,10 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from deepshade.errors import DeepshadeError, LimitError
+from deepshade.errors import DeepshadeError, EngineError, LimitError
 from deepshade.problems import MEDIA_TYPE, facts_of, kind_of, type_uri
+
+log = logging.getLogger("deepshade.service")
 
 # Which option of `deepshade serve` sets a limit: what its operator can do about it.
 _OPTIONS = {
@@ -51,6 +54,8 @@ def from_error(error: DeepshadeError) -> Problem:
     """The problem that an error of the core package is, with the facts that it carries."""
     status, kind = kind_of(error)
     fix = error.fix
+    if isinstance(error, EngineError):  # what can't run here at all is refused before
+        status, kind = 500, "bad-bundle"
     if isinstance(error, LimitError) and error.limit in _OPTIONS:
         option = _OPTIONS[error.limit]
         fix = f"send a smaller picture, or start the service with a higher {option}"
@@ -82,7 +87,10 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(DeepshadeError)
     async def _(request: Request, error: DeepshadeError) -> JSONResponse:
-        return respond(from_error(error))
+        problem = from_error(error)
+        if problem.status >= 500:
+            log.error("%s: %s", request.url.path, error)
+        return respond(problem)
 
     @app.exception_handler(HTTPException)
     async def _(request: Request, error: HTTPException) -> JSONResponse:

@@ -1,33 +1,124 @@
-"""Shading one picture: decode, infer, encode (`planner` has the step between the first two)."""
+"""A request's path, from uploaded bytes to an encoded answer: decode, plan, infer, encode."""
 
 from __future__ import annotations
 
 import io
 import json
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade import exr, pictures
-from deepshade.attributes import ATTRIBUTES
+from deepshade import exr, pictures, tensors
 from deepshade.bundles import Bundle
-from deepshade.effects import EFFECTS
+from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.engines import Engine
 from deepshade.gbuffer import GBuffer, load_gbuffer
-from deepshade_service.parameters import ShadeParameters
-from deepshade_service.planner import Json, Plan, known_pixels
-from deepshade_service.pool import Cancelled
+from deepshade.machine import trim
+from deepshade_service.memory import MemoryBudget, Need, need_of, size_of
+from deepshade_service.models import Models
+from deepshade_service.parameters import LENS, ShadeParameters
+from deepshade_service.plan import Facts, Json, ShadePlan, explain, facts_of
 from deepshade_service.problems import Problem
-from deepshade_service.tiles import Tile
+from deepshade_service.selection import Candidate, Selection, select
+from deepshade_service.telemetry import Stopwatch
+from deepshade_service.tiles import plan_tiles
 from deepshade_service.uploads import Upload
+from deepshade_service.workers import Cancelled, Workers
 
 Float = NDArray[np.float32]
-Facts = dict[str, str | float | int]
 
-# So far away nothing depends on where exactly; what matters is to stay finite, in 16 bits too.
-_MOST_RADII = 6e4
+# Work that used more hands memory back at once, other work when the service is idle.
+_BIG = 512 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class Shaded:
+    """An encoded picture, or a plan as JSON, and how it was made."""
+
+    content: bytes
+    media_type: str
+    facts: Facts
+    pixels: int
+    computed: int
+    watch: Stopwatch
+
+
+@dataclass(frozen=True, slots=True)
+class Shader:
+    """Shades pictures with these models, on these workers, within this memory."""
+
+    models: Models
+    workers: Workers
+    memory: MemoryBudget
+    limits: exr.Limits
+
+    async def shade(
+        self, files: list[Upload], asked: ShadeParameters, candidates: list[Candidate]
+    ) -> Shaded:
+        """The answer, by one of the candidates. Waits, in turn, for a worker and for memory.
+
+        Raises what the steps raise, and Cancelled.
+        """
+        watch = Stopwatch()
+
+        def read(_: threading.Event) -> list[exr.Header]:
+            with watch.time("decode"):
+                return read_headers(files, asked, self.limits)
+
+        def work(cancelled: threading.Event) -> Shaded:
+            if cancelled.is_set():
+                raise Cancelled
+            with watch.time("decode"):
+                gbuffer = decode(files, headers, bundle, asked, self.limits)
+            with watch.time("plan"):
+                plan = plan_shading(gbuffer, bundle, asked, need.max_pixels)
+                made = explain(gbuffer, headers, selection, asked, plan, need)
+                facts = facts_of(gbuffer, plan, made)
+            if engine is None:
+                content = json.dumps(made, indent=2).encode()
+                return Shaded(content, "application/json", facts, 0, 0, watch)
+            with watch.time("infer"):
+                shade = infer(gbuffer, plan, engine, cancelled)
+            with watch.time("encode"):
+                content, media_type = encode(shade, gbuffer, asked, facts, made)
+            return Shaded(content, media_type, facts, shade[0].size, plan.computed, watch)
+
+        headers = await self.workers.run(read)
+        selection = await self._select(headers, asked, candidates)
+        bundle = selection.bundle
+        need = need_of(headers, bundle, self.memory.total)
+        engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
+        async with self.memory.hold(need.total):
+            return await self.workers.run(_giving_back(engine, need)(work))
+
+    async def _select(
+        self, headers: list[exr.Header], asked: ShadeParameters, candidates: list[Candidate]
+    ) -> Selection:
+        """Which bundle; a time is predicted as if there were no background."""
+        megapixels: dict[str, float] = {}
+        for bundle, _ in candidates if asked.budget_ms is not None else ():
+            most = need_of(headers, bundle, self.memory.total).max_pixels
+            grid = plan_tiles(*size_of(headers), bundle.size_multiple, bundle.halo, most)
+            megapixels[bundle.name] = grid.computed / 1e6
+        return await select(self.models, candidates, asked, megapixels)
+
+
+def read_headers(
+    files: Sequence[Upload], asked: ShadeParameters, limits: exr.Limits
+) -> list[exr.Header]:
+    """The files' checked headers, in which the lens is the one asked for.
+
+    Raises what `exr.read_header` raises.
+    """
+    headers = [exr.read_header(file.data, limits) for file in files]
+    lens = {SETTINGS[name].header: getattr(asked, name) for name in LENS}
+    for part in (part for header in headers for part in header.parts):
+        part.attributes.update({key: value for key, value in lens.items() if value is not None})
+    return headers
 
 
 def decode(
@@ -39,12 +130,14 @@ def decode(
 ) -> GBuffer:
     """The G-buffer that the bundle's network needs, found or derived in the files.
 
-    Nothing else is decoded. `headers` are the files' own, read before. Raises what
-    `load_gbuffer` raises.
+    Nothing else is decoded. Raises what `load_gbuffer` raises.
     """
+    needs = list(bundle.inputs)
+    if EFFECTS[bundle.effect].background == "light" and "light" not in needs:
+        needs.append("light")
     return load_gbuffer(
         [(file.name, file.data) for file in files],
-        bundle.inputs,
+        needs,
         profile=asked.profile,
         mapping=asked.mapping,
         fov=asked.fov,
@@ -53,79 +146,76 @@ def decode(
     )
 
 
-def infer(
-    gbuffer: GBuffer,
-    plan: Plan,
-    engine: Engine,
-    cancelled: threading.Event,
-    *,
-    consume: bool = False,
-) -> Float:
-    """Run the network tile by tile: (C', H, W), the effect's background where there is none.
+def plan_shading(
+    gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters, max_pixels: int
+) -> ShadePlan:
+    """What to compute, in tiles of at most `max_pixels`.
 
-    What no tile answers is background, or known. `consume` allows to scale the G-buffer's own
-    positions in place, where that spares a copy of them; it is of no use afterwards. Raises
-    Cancelled between tiles when the event is set.
+    The radius is the one asked for, else the header's, else the bundle's. A tile that would only
+    answer background is left out, where the effect says what stands there. Raises Problem 422
+    for an impossible radius in the header.
     """
-    effect = EFFECTS[engine.bundle.effect]
-    divisors = _divisors(engine.bundle, plan.radius)
-    if consume and any(tile.shape == gbuffer.shape for tile in plan.tiling):
-        for name, divisor in divisors.items():
-            for plane in gbuffer.attributes[name]:
-                _scale(plane, divisor, plane)
-        divisors = {}
-    answered = sum(_valid_area(tile) for tile in plan.tiling)
+    radius, source = _radius(gbuffer, bundle, asked)
+    grid = plan_tiles(*gbuffer.shape, bundle.size_multiple, bundle.halo, max_pixels)
+    tiles = tuple(grid)
+    if EFFECTS[bundle.effect].background != "shaded":
+        tiles = tuple(tile for tile in tiles if not gbuffer.background[tile.answered].all())
+    return ShadePlan(radius, source, grid.shape, tiles)
+
+
+def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threading.Event) -> Float:
+    """(C', H, W): the network's answer, and the effect's background where there is none.
+
+    A per-channel network runs once for each colour channel. Raises Cancelled between tiles when
+    the event is set, and Problem 500 for an answer that isn't finite.
+    """
+    bundle = engine.bundle
+    effect = EFFECTS[bundle.effect]
+    scale = tensors.length_scale(effect, gbuffer.attributes, plan.radius)
     shade = np.empty((len(effect.outputs), *gbuffer.shape), np.float32)
-    if answered < gbuffer.background.size:
-        shade.fill(effect.background)
-    for planes, out in passes(gbuffer, engine.bundle, divisors, shade):
-        for tile in plan.tiling:
+    for channel in range(3) if bundle.per_channel else (None,):
+        planes = tensors.planes(gbuffer.attributes, bundle.inputs, scale, channel=channel)
+        out = shade if channel is None else shade[channel : channel + 1]
+        for tile in plan.tiles:
             if cancelled.is_set():
                 raise Cancelled
-            rows, columns = tile.rows, tile.columns
-            answer = engine.predict(cut(planes, tile))[
-                0,
-                :,
-                rows.first - rows.start : rows.last - rows.start,
-                columns.first - columns.start : columns.last - columns.start,
-            ]
+            answer = engine.predict(tensors.cut(planes, tile.box))[0][:, *tile.inner]
             if answer.shape == shade.shape:
                 shade = answer  # all of it at once: no copy
             else:
-                out[:, rows.first : rows.last, columns.first : columns.last] = answer
-    if gbuffer.background.any():
+                out[:, *tile.answered] = answer
+    if effect.background == "light":
+        np.copyto(shade, gbuffer.attributes["light"], where=gbuffer.background)
+    elif effect.background != "shaded" and gbuffer.background.any():
         np.copyto(shade, np.float32(effect.background), where=gbuffer.background)
-    if plan.known is not None:
-        np.copyto(shade, plan.known.value, where=plan.known.pixels)
     # One sum, unless something is wrong: a single number that isn't finite makes it so too.
     if not np.isfinite(shade.sum()) and not np.isfinite(shade).all():
         raise Problem(
             500,
             "bad-answer",
-            f"the network '{engine.bundle.name}' gave numbers that aren't finite",
+            f"the network '{bundle.name}' gave numbers that aren't finite",
             fix="report it with the picture; another ?radius= or ?bundle= may work",
         )
     return shade
 
 
 def encode(
-    shade: Float, gbuffer: GBuffer, asked: ShadeParameters, facts: Facts, plan: Json
+    shade: Float, gbuffer: GBuffer, asked: ShadeParameters, facts: Facts, made: Json
 ) -> tuple[bytes, str]:
     """The answer's bytes and media type; it lies where the G-buffer lay.
 
-    Its header holds `facts` and, as JSON, the `plan`.
+    Its header holds `facts` and, as JSON, the plan (`made`).
     """
+    effect = EFFECTS[str(facts["effect"])]
     if asked.format == "png":
-        picture = pictures.of_effect(shade, EFFECTS[str(facts["effect"])])
-        return pictures.png(picture), "image/png"
-    outputs = "Y" if len(shade) == 1 else "RGB"
+        return pictures.png(pictures.of_effect(shade, effect)), "image/png"
     attributes = gbuffer.placement()
     attributes |= {f"deepshade:{name}": value for name, value in facts.items()}
-    attributes["deepshade:plan"] = json.dumps(plan, separators=(",", ":"))
+    attributes["deepshade:plan"] = json.dumps(made, separators=(",", ":"))
     stream = io.BytesIO()
     exr.write(
         stream,
-        dict(zip(outputs, shade, strict=True)),
+        dict(zip(effect.outputs, shade, strict=True)),
         attributes=attributes,
         compression=asked.compression,
         half=asked.half,
@@ -135,123 +225,33 @@ def encode(
     return stream.getvalue(), "image/x-exr"
 
 
-def describe(gbuffer: GBuffer, plan: Plan, engine: Engine, made: Json) -> Facts:
-    """How an answer was made, for its EXR header and the response's headers.
-
-    `made` is the plan as JSON; facts that aren't known are left out.
-    """
-    bundle = engine.bundle
-    facts: Facts = {
-        "effect": bundle.effect,
-        "bundle": bundle.name,
-        "bundle_sha256": bundle.sha256,
-        "engine": engine.backend.engine,
-        "precision": engine.backend.precision,
-        "radius": plan.radius,
-        "radius_source": plan.radius_source,
-        "mapped": _listed(gbuffer.mapped),
-        "derived": _listed(gbuffer.derived),
-        "background_pixels": made["pixels"]["background"],
-        "nonfinite_pixels": int(gbuffer.nonfinite),
-        "known_pixels": known_pixels(plan),
-        "computed_pixels": plan.computed,
-        "tiles": len(plan.tiling),
-    }
-    return facts | {
-        name: made[name] for name in ("dssim", "added", "predicted_ms") if made[name] is not None
-    }
+@contextmanager
+def _giving_back(engine: Engine | None, need: Need) -> Iterator[None]:
+    """Memory that the block leaves behind is given back if it was much."""
+    try:
+        yield
+    finally:
+        if engine is not None and need.total > _BIG:
+            engine.shrink()
+            trim()
 
 
-def first_input(gbuffer: GBuffer, plan: Plan, bundle: Bundle) -> Float:
-    """What the network is given first for this plan, (1, C, h, w): for timing it alone."""
-    shade = np.empty((len(EFFECTS[bundle.effect].outputs), 1, 1), np.float32)
-    planes, _ = next(passes(gbuffer, bundle, _divisors(bundle, plan.radius), shade))
-    return cut(planes, next(iter(plan.tiling)))
-
-
-def _divisors(bundle: Bundle, radius: float) -> dict[str, float]:
-    """What attributes have to be divided by for the network: positions, by the radius."""
-    if bundle.position_scale != "1/radius":
-        return {}
-    return {name: radius for name in bundle.inputs if ATTRIBUTES[name].kind == "point"}
-
-
-Plane = tuple[Float, float | None]  # (H, W) and what to divide it by, None if by nothing
-
-
-def passes(
-    gbuffer: GBuffer, bundle: Bundle, divisors: Mapping[str, float], shade: Float
-) -> Iterator[tuple[list[Plane], Float]]:
-    """Each network run's input planes, in network order, and the part of `shade` it fills.
-
-    A per-channel effect is one run for each colour channel, with that channel of its colours.
-    """
-    effect = EFFECTS[bundle.effect]
-    runs: list[int | None] = list(range(len(effect.outputs))) if effect.per_channel else [None]
-    for run in runs:
-        planes: list[Plane] = []
-        for name in bundle.inputs:
-            pixels = gbuffer.attributes[name]
-            one = run is not None and ATTRIBUTES[name].kind == "colour"
-            chosen = pixels[run : run + 1] if run is not None and one else pixels
-            planes += [(plane, divisors.get(name)) for plane in chosen]
-        yield planes, shade if run is None else shade[run : run + 1]
-
-
-def cut(planes: list[Plane], tile: Tile) -> Float:
-    """(1, C, h, w): the tile of every plane, scaled; zero, which is background, past the edge.
-
-    No copy where the planes are what is wanted already.
-    """
-    height, width = planes[0][0].shape
-    rows, columns = tile.rows, tile.columns
-    if tile.shape == (height, width) and (block := _block(planes)) is not None:
-        return block[None]
-    bottom, right = min(rows.stop, height), min(columns.stop, width)
-    inside = (slice(0, bottom - rows.start), slice(0, right - columns.start))
-    gbuffer = np.empty((1, len(planes), *tile.shape), np.float32)
-    gbuffer[:, :, inside[0].stop :, :] = 0
-    gbuffer[:, :, :, inside[1].stop :] = 0
-    for (plane, divisor), target in zip(planes, gbuffer[0], strict=True):
-        source = plane[rows.start : bottom, columns.start : right]
-        if divisor is None:
-            target[inside] = source
-        else:
-            _scale(source, divisor, target[inside])
-    return gbuffer
-
-
-def _scale(source: Float, divisor: float, out: Float) -> None:
-    """Positions in radii, so bounded that they stay finite."""
-    with np.errstate(over="ignore"):
-        np.divide(source, np.float32(divisor), out=out)
-    if out.size and (out.max() > _MOST_RADII or out.min() < -_MOST_RADII):
-        np.clip(out, -_MOST_RADII, _MOST_RADII, out=out)
-
-
-def _block(planes: list[Plane]) -> Float | None:
-    """(C, H, W) if the planes lie one after the other in one array, unscaled; else None."""
-    arrays = [plane for plane, _ in planes]
-    owner = arrays[0].base
-    if any(divisor is not None for _, divisor in planes) or not (
-        isinstance(owner, np.ndarray)
-        and owner.dtype == np.float32
-        and owner.flags.c_contiguous
-        and all(plane.base is owner and plane.flags.c_contiguous for plane in arrays)
-    ):
-        return None
-    size = arrays[0].nbytes
-    starts = [plane.ctypes.data - owner.ctypes.data for plane in arrays]
-    first = starts[0] // size
-    if starts != [(first + k) * size for k in range(len(arrays))]:
-        return None
-    return owner.reshape(-1, *arrays[0].shape)[first : first + len(arrays)]
-
-
-def _valid_area(tile: Tile) -> int:
-    rows, columns = tile.rows, tile.columns
-    return (rows.last - rows.first) * (columns.last - columns.first)
-
-
-def _listed(entries: dict[str, str]) -> str:
-    return "; ".join(f"{name}: {how}" for name, how in sorted(entries.items()))
+def _radius(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> tuple[float, str]:
+    if asked.radius is not None:
+        return asked.radius, "request"
+    setting = SETTINGS["radius"]
+    stored = gbuffer.header.get(setting.header)
+    if stored is None or "radius" not in EFFECTS[bundle.effect].settings:
+        return bundle.radius, "bundle"
+    try:
+        radius = float(stored)
+    except (TypeError, ValueError):
+        radius = float("nan")
+    if not setting.lowest <= radius <= setting.highest:
+        raise Problem(
+            422,
+            "bad-header",
+            f"the image's header says {setting.header} = {str(stored)[:60]}",
+            fix="it must be a positive number; ?radius= overrides it",
+        )
+    return radius, "header"

@@ -40,32 +40,25 @@ class Telemetry:
 
     def __init__(self, *, queued: Callable[[], float], held: Callable[[], float]) -> None:
         self._registry = CollectorRegistry()
-        self._requests = Counter(
-            "deepshade_requests",
-            "Requests answered, by route and status",
-            ["route", "status"],
-            registry=self._registry,
+
+        def counter(name: str, text: str, *labels: str) -> Counter:
+            return Counter(f"deepshade_{name}", text, labels, registry=self._registry)
+
+        self._requests = counter(
+            "requests", "Requests answered, by route and status", "route", "status"
+        )
+        self._pixels = counter("pixels", "Pixels shaded", "effect")
+        self._computed = counter(
+            "computed_pixels", "Pixels that networks computed, overlaps included", "effect"
+        )
+        self._nonfinite = counter(
+            "nonfinite_pixels", "Pixels with a NaN or infinity, treated as background", "effect"
         )
         self._stages = Histogram(
             "deepshade_stage_seconds",
             "Time of each stage of a shaded picture",
             ["effect", "stage"],
             buckets=_SECONDS,
-            registry=self._registry,
-        )
-        self._pixels = Counter(
-            "deepshade_pixels", "Pixels shaded", ["effect"], registry=self._registry
-        )
-        self._computed = Counter(
-            "deepshade_computed_pixels",
-            "Pixels that networks computed, overlaps and padding included",
-            ["effect"],
-            registry=self._registry,
-        )
-        self._nonfinite = Counter(
-            "deepshade_nonfinite_pixels",
-            "Pixels with a NaN or an infinity, treated as background",
-            ["effect"],
             registry=self._registry,
         )
         for name, text, read in (

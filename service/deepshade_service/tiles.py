@@ -1,10 +1,12 @@
-"""Cutting a picture into overlapping tiles, so that memory is bounded and the answer the same.
+"""A grid of equal, overlapping tiles: memory is bounded, and the answer is the whole picture's.
 
 A network that sees `halo` pixels around each pixel gives the same answer for a tile as for the
 whole picture, if the tile carries that many pixels of its neighbours. Two details make "same"
 exact rather than nearly: every tile starts on a multiple of the network's coarsest cell (else the
-pooling windows fall differently), and tiles at the picture's edge end where the padded picture
-ends (else the network's own zero padding would start elsewhere).
+pooling windows fall differently), and the last one ends where the padded picture ends (else the
+network's own zero padding would start elsewhere).
+
+All tiles of a picture have one size, and there are few sizes, because engines compile each.
 """
 
 from __future__ import annotations
@@ -12,6 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
+from math import prod
+
+from deepshade.tensors import up
+
+MIN_SIDE = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,98 +40,111 @@ class Tile:
     columns: Span
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """Computed (height, width)."""
-        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+    def box(self) -> tuple[int, int, int, int]:
+        """What is computed: top, bottom, left, right."""
+        return self.rows.start, self.rows.stop, self.columns.start, self.columns.stop
+
+    @property
+    def answered(self) -> tuple[slice, slice]:
+        """The part of the picture that it answers."""
+        rows, columns = self.rows, self.columns
+        return slice(rows.first, rows.last), slice(columns.first, columns.last)
+
+    @property
+    def inner(self) -> tuple[slice, slice]:
+        """The same as a part of the tile."""
+        return tuple(  # type: ignore[return-value]
+            slice(span.first - span.start, span.last - span.start)
+            for span in (self.rows, self.columns)
+        )
 
 
 @dataclass(frozen=True, slots=True)
-class Tiling:
-    """A picture cut into `rows` x `columns` spans; every combination of two is a tile."""
+class Grid:
+    """Spans of rows and of columns; every combination of two is a tile, all computed at `shape`."""
 
     rows: tuple[Span, ...]
     columns: tuple[Span, ...]
+    shape: tuple[int, int]
 
     def __len__(self) -> int:
         return len(self.rows) * len(self.columns)
 
     def __iter__(self) -> Iterator[Tile]:
-        return (Tile(rows, columns) for rows in self.rows for columns in self.columns)
+        return (Tile(rows, columns) for rows, columns in product(self.rows, self.columns))
+
+    @property
+    def computed(self) -> int:
+        """Pixels that the network computes, overlaps and padding included."""
+        return len(self) * prod(self.shape)
 
 
-def plan_tiles(height: int, width: int, *, multiple: int, halo: int, max_pixels: int) -> Tiling:
-    """The tiling with the fewest computed pixels whose tiles have at most `max_pixels`.
+def plan_tiles(height: int, width: int, multiple: int, halo: int, max_pixels: int) -> Grid:
+    """One tile if the padded picture has at most `max_pixels`, else the grid of such tiles that
+    computes the fewest pixels.
 
-    `multiple` is the network's size multiple and `halo` its reach, both in pixels. Tiles of
-    `smallest_tile` are used even if they exceed `max_pixels`.
+    `multiple` is the network's size multiple and `halo` its reach, both in pixels. Where even
+    the smallest sensible tiles (`min_tile`) exceed `max_pixels`, it is a grid of those.
     """
     halo = up(halo, multiple)
-    best: tuple[int, int, int] | None = None  # pixels computed, rows, columns
-    for across in range(1, math.ceil(width / multiple) + 1):
-        widest, columns = _sizes(width, across, multiple, halo)
-        if best is not None and columns * up(height, multiple) >= best[0]:
-            break  # more columns only add overlap
-        down = _fewest_cuts(height, multiple, halo, max_pixels // widest)
-        if down is not None:
-            computed = columns * _sizes(height, down, multiple, halo)[1]
-            if best is None or computed < best[0]:
-                best = computed, down, across
-    if best is None:
-        step = _least(multiple, halo)
-        best = 0, math.ceil(height / step), math.ceil(width / step)
-    return Tiling(_cut(height, best[1], multiple, halo), _cut(width, best[2], multiple, halo))
+    best = padded(height, width, multiple)
+    if prod(best) > max_pixels:
+        tall, wide = (_costs(length, multiple, halo) for length in (height, width))
+        shapes = [(h, w) for w in wide for h in tall if h * w <= max_pixels]
+        shapes = shapes or [(min(tall), min(wide))]
+        best = min(shapes, key=lambda shape: tall[shape[0]] * wide[shape[1]])
+    rows, columns = (
+        _spans(length, side, multiple, halo)
+        for length, side in zip((height, width), best, strict=True)
+    )
+    return Grid(rows, columns, best)
 
 
-def smallest_tile(height: int, width: int, *, multiple: int, halo: int) -> int:
+def min_tile(height: int, width: int, multiple: int, halo: int) -> int:
     """Pixels of the smallest sensible tile: as wide inside as its two halos together.
 
     Three quarters of it are overlap. With still smaller tiles the work explodes: with a halo of
     256 and tiles that are valid in 64 x 64, each pixel would be computed 81 times.
     """
     halo = up(halo, multiple)
-    side = _least(multiple, halo) + 2 * halo
-    return min(up(height, multiple), side) * min(up(width, multiple), side)
+    return prod(min(_costs(length, multiple, halo)) for length in (height, width))
 
 
 def padded(height: int, width: int, multiple: int) -> tuple[int, int]:
-    """The size rounded up to the network's multiple."""
-    return up(height, multiple), up(width, multiple)
+    """The size at which a whole picture is computed."""
+    return _side(height, multiple), _side(width, multiple)
 
 
-def _cut(length: int, count: int, multiple: int, halo: int) -> tuple[Span, ...]:
-    """About `count` equal spans of whole cells that cover `length` pixels."""
-    end = up(length, multiple)
-    step = up(math.ceil(end / count), multiple)
-    return tuple(
-        Span(max(0, at - halo), min(end, at + step + halo), at, min(length, at + step))
-        for at in range(0, end, step)
-    )
+def _side(length: int, multiple: int) -> int:
+    """The least computed side for so many pixels: 64, 128, 256, or a multiple of 64 beyond.
+
+    With a size multiple that divides no 64: the same of the least multiple of it from 64 on.
+    """
+    step = up(MIN_SIDE, multiple)
+    steps = math.ceil(length / step)
+    return step * (steps if steps != 3 else 4)
 
 
-def _sizes(length: int, count: int, multiple: int, halo: int) -> tuple[int, int]:
-    """(pixels of the largest span, sum of all) of `_cut`, or more if the halos exceed the spans."""
-    end = up(length, multiple)
-    step = up(math.ceil(end / count), multiple)
-    count = math.ceil(end / step)
-    return min(end, step + min(2, count - 1) * halo), end + 2 * halo * (count - 1)
+def _costs(length: int, multiple: int, halo: int) -> dict[int, int]:
+    """The sides that a tile may have along `length`, largest first, and what all tiles add to."""
+    end = _side(length, multiple)
+    least = _side(4 * halo or 1, multiple)
+    step = up(MIN_SIDE, multiple)
+    smaller = (side for side in range(end - step, least - 1, -step) if side != 3 * step)
+    return {side: side * len(_spans(length, side, multiple, halo)) for side in (end, *smaller)}
 
 
-def _fewest_cuts(length: int, multiple: int, halo: int, longest: int) -> int | None:
-    """The fewest cuts after which no span is computed over more than `longest` pixels."""
-    if up(length, multiple) <= longest:
-        return 1
-    # Two spans share one inner edge, so each needs only one halo.
-    if up(math.ceil(up(length, multiple) / 2), multiple) + halo <= longest:
-        return 2
-    room = (longest - 2 * halo) // multiple * multiple
-    return math.ceil(length / room) if room > 0 else None
+def _spans(length: int, side: int, multiple: int, halo: int) -> tuple[Span, ...]:
+    """Spans of one size that cover [0, length); neighbours share two halos.
 
-
-def _least(multiple: int, halo: int) -> int:
-    """The least that a tile is valid in, along one axis."""
-    return max(multiple, 2 * halo)
-
-
-def up(value: int, multiple: int) -> int:
-    """`value` rounded up to a multiple."""
-    return -(-value // multiple) * multiple
+    A last one that would pass the end of the padded picture is shifted back to end there.
+    """
+    end = _side(length, multiple)
+    spans: list[Span] = []
+    start = first = 0
+    while first < length:
+        stop = start + side
+        last = length if stop == end else min(stop - halo, length)
+        spans.append(Span(start, stop, first, last))
+        start, first = min(stop - 2 * halo, end - side), last
+    return tuple(spans)

@@ -186,7 +186,7 @@ def test_effects(server):
     with Client(server) as client:
         assert client.wait_until_ready()["status"] == "ready"
         names = [effect["name"] for effect in client.effects()]
-        assert names[0] == "ao"
+        assert "ao" in names
         assert client.effect("ao")["bundles"][0]["name"] == "tiny"
 
 
@@ -202,7 +202,7 @@ def test_async(server, make_exr):
 
     answers, effects, one = asyncio.run(work())
     assert [a.channels()["Y"].shape[1] for a in answers] == [8, 9, 10, 11]
-    assert effects[0] == one
+    assert one in effects
 
 
 def test_mock_transport(make_exr):

@@ -156,8 +156,8 @@ def test_what_chooses_the_bundle_reaches_the_service(run, views, tmp_path):
     assert plan["asked"] == {"precision": "fp32", "max_error": 0.5}
     _, err = run(*arguments, "--quality", "best", code=1)
     assert "no bundle 'best'" in err
-    _, err = run(*arguments, "--budget-ms", "5", code=1)
-    assert "calibrat" in err
+    _, err = run(*arguments, "--budget-ms", "1e-6", code=1)
+    assert "in 1e-06 ms" in err
     _, err = run("shade", "ao", views / "a.exr", code=2)
     assert "--out" in err
 
@@ -225,7 +225,7 @@ def test_several_are_in_flight(start, views, tmp_path, monkeypatch):
     from deepshade_client import AsyncClient, Options
 
     local = start(workers=3)
-    engine = local.service.models.engine(local.service.models.candidate("ao"))
+    engine = local.engine()
     barrier, predict = threading.Barrier(3, timeout=10), engine.predict
     engine.predict = lambda gbuffer: (barrier.wait(), predict(gbuffer))[1]
     tasks = plan([str(views)], str(tmp_path / "out"), effect="ao", suffix=".exr")
@@ -246,7 +246,7 @@ def test_ctrl_c_leaves_no_half_files(start, views, tmp_path):
 
     local = start(workers=1)
     gate = threading.Event()
-    engine = local.service.models.engine(local.service.models.candidate("ao"))
+    engine = local.engine()
     predict = engine.predict
     engine.predict = lambda gbuffer: (gate.wait(20), predict(gbuffer))[1]
     out = tmp_path / "out"

@@ -41,33 +41,6 @@ def test_an_error_in_another_thread_comes_out():
         threads.run_all(work, range(100), 2)
 
 
-def test_work_at_the_same_time_stays_on_its_own_thread(monkeypatch):
-    monkeypatch.setattr(threads, "cpu_count", lambda: 2)
-    here, release = threading.Event(), threading.Event()
-
-    def other():
-        with threads.busy():
-            here.set()
-            release.wait(10)
-
-    def work(_):
-        used.add(threading.get_ident())
-        time.sleep(0.002)
-
-    crowd = threading.Thread(target=other)
-    crowd.start()
-    try:
-        assert here.wait(10)
-        used: set[int] = set()
-        with threads.busy() as count:
-            assert count == 2
-            threads.run_all(work, range(20), 2)
-        assert used == {threading.get_ident()}
-    finally:
-        release.set()
-        crowd.join()
-
-
 def test_a_call_gets_on_while_all_threads_are_busy():
     release = threading.Event()
     many = 32  # more than there are threads

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +26,15 @@ from onnx import TensorProto, helper, numpy_helper
 
 from deepshade import exr
 from deepshade.bundles import write_config
+from deepshade.engines import Engine
 from deepshade_service.app import Service, create_app
 from deepshade_service.cli import listen
 from deepshade_service.config import Settings
 
 REPOSITORY = Path(__file__).parents[2]
 LEVELS = 3
+# ONNX Runtime compiles nothing for each size, as OpenVINO does, which would make tests slow.
+ORDINARY: dict[str, Any] = {"memory": 2**30, "engine": "onnxruntime"}
 
 
 def unet(width: int = 4, levels: int = 3, seed: int = 0) -> onnx.ModelProto:
@@ -114,11 +119,12 @@ def unet(width: int = 4, levels: int = 3, seed: int = 0) -> onnx.ModelProto:
     return model
 
 
-def write_bundle(folder: Path, model: onnx.ModelProto, *, levels: int, **config: Any) -> None:
+def write_bundle(
+    folder: Path, model: onnx.ModelProto, *, levels: int, dssim: float = 0.25, **config: Any
+) -> None:
     """A bundle around a model that `unet` made."""
     folder.mkdir(parents=True)
     (folder / "model.onnx").write_bytes(model.SerializeToString())
-    (folder / "model.safetensors").write_bytes(b"\x02\0\0\0\0\0\0\0{}")
     settings = {
         "effect": "ao",
         "name": folder.name,
@@ -128,9 +134,9 @@ def write_bundle(folder: Path, model: onnx.ModelProto, *, levels: int, **config:
         "fov": 50.0,
         "size_multiple": 2 ** (levels - 1),
         "halo": 6 * 2**levels,
-        "metrics": {"error": {"test-real": {"exact": {"dssim": 0.25}}}},
+        "bytes_per_pixel": 128,
     }
-    write_config(folder, **(settings | config))
+    write_config(folder, settings | config, {"error": {"test-real": {"exact": {"dssim": dssim}}}})
 
 
 @pytest.fixture(scope="session")
@@ -202,10 +208,23 @@ class Local:
         self._server = uvicorn.Server(config)
         listener = listen("127.0.0.1", 0)
         self.address = listener.getsockname()
-        self._thread = threading.Thread(target=self._server.run, args=([listener],))
+        self._thread = threading.Thread(target=asyncio.run, args=(self._serve(listener),))
         self._thread.start()
         url = f"http://127.0.0.1:{self.address[1]}"
         self.client = httpx.Client(base_url=url, trust_env=False, timeout=60)
+
+    async def _serve(self, listener: socket.socket) -> None:
+        self.loop = asyncio.get_running_loop()
+        await self._server.serve([listener])
+
+    def run(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """Run a coroutine on the service's event loop."""
+        return asyncio.run_coroutine_threadsafe(work, self.loop).result(30)
+
+    def engine(self, name: str = "tiny") -> Engine:
+        """The engine of that AO bundle, loaded if it isn't yet."""
+        (bundle,) = self.service.models.find("ao", name)
+        return self.run(self.service.models.engine(bundle, self.service.models.backend(bundle)))
 
     def wait(self, path: str = "/readyz") -> None:
         deadline = time.monotonic() + 30
@@ -223,7 +242,7 @@ class Local:
 @pytest.fixture(scope="session")
 def service(models: Path) -> Iterator[Local]:
     """A service with ordinary settings, shared by all tests that need no others."""
-    local = Local(Settings(models=models, memory=2**30))
+    local = Local(Settings(**ORDINARY, models=models))
     local.wait()
     yield local
     local.stop()
@@ -234,13 +253,26 @@ def client(service: Local) -> httpx.Client:
     return service.client
 
 
+def until(true: Callable[[], object]) -> None:
+    """Wait for a condition."""
+    deadline = time.monotonic() + 20
+    while not true():
+        assert time.monotonic() < deadline, "it doesn't come true"
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope="session")
+def wait_until() -> Callable[..., None]:
+    return until
+
+
 @pytest.fixture
 def start(models: Path) -> Iterator[Callable[..., Local]]:
     """`start(ready=True, **settings)`: a service of one's own."""
     started: list[Local] = []
 
     def start(*, ready: bool = True, **settings: Any) -> Local:
-        local = Local(Settings(**({"models": models, "memory": 2**30} | settings)))
+        local = Local(Settings(**(ORDINARY | {"models": models} | settings)))
         started.append(local)
         local.wait("/readyz" if ready else "/healthz")
         return local
@@ -275,7 +307,7 @@ def start_server(models: Path) -> Iterator[Callable[..., Server]]:
 
     def start(*options: str, wait: bool = True, folder: Path | None = None) -> Server:
         command = "import sys; from deepshade.cli import main; sys.exit(main())"
-        arguments = ["--models", str(folder or models), "--calibration", "off"]
+        arguments = ["--models", str(folder or models), "--engine", "onnxruntime"]
         process = subprocess.Popen(
             [sys.executable, "-c", command, "serve", "--port", "0", *arguments, *options],
             stdout=subprocess.PIPE,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-import time
+import asyncio
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +11,7 @@ import pytest
 from deepshade import exr
 from deepshade.errors import ConfigError
 from deepshade.machine import resident, trim
-from deepshade_service.memory import MemoryBudget, parse_size
-from deepshade_service.room import room_for
+from deepshade_service.memory import MemoryBudget, need_of, parse_size
 
 
 @pytest.mark.parametrize(
@@ -30,38 +28,60 @@ def test_bad_sizes(text):
         parse_size(text)
 
 
-def test_the_budget_makes_requests_wait():
-    budget = MemoryBudget(100)
+def test_the_budget_serves_who_comes_first():
+    """Were small amounts let past, a large one would starve while there are always small ones."""
     order = []
 
-    def second():
-        with budget.hold(60):
-            order.append("second")
+    async def use(budget, name, amount, gate):
+        async with budget.hold(amount):
+            order.append(name)
+            await gate.wait()
 
-    with budget.hold(60):
-        thread = threading.Thread(target=second)
-        thread.start()
-        with budget.hold(40):
-            order.append("beside")
-        order.append("first")
-    thread.join(5)
-    assert order == ["beside", "first", "second"]
-    with budget.hold(10**9):  # never more than there is
-        pass
+    async def scenario():
+        budget, gates = MemoryBudget(100), {name: asyncio.Event() for name in "abcde"}
+        users = []
+        for name, amount in (("a", 60), ("b", 40), ("c", 90), ("d", 10), ("e", 10**9)):
+            users.append(asyncio.create_task(use(budget, name, amount, gates[name])))
+            await asyncio.sleep(0)
+        gates["b"].set()
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert order == ["a", "b"]  # 'd' would fit, but 'c' was there before
+        for gate in gates.values():
+            gate.set()
+        await asyncio.gather(*users)
+        assert order == ["a", "b", "c", "d", "e"]
+        assert budget._free == budget.total
+
+    asyncio.run(scenario())
 
 
-def test_waiting_for_memory_can_be_given_up():
-    budget = MemoryBudget(100)
-    cancelled = threading.Event()
-    cancelled.set()
-    with budget.hold(100), budget.hold(50, cancelled):
-        pass
-    with budget.hold(100):
-        pass
+@pytest.mark.parametrize("granted", [False, True])
+def test_waiting_for_memory_can_be_given_up(granted):
+    async def use(budget):
+        async with budget.hold(50):
+            await asyncio.sleep(10)
+
+    async def scenario():
+        budget = MemoryBudget(100)
+        async with budget.hold(100):
+            waiting = asyncio.create_task(use(budget))
+            await asyncio.sleep(0)
+            if not granted:
+                waiting.cancel()
+                await asyncio.sleep(0)
+        waiting.cancel()  # when it has been granted, but before it could go on
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        assert budget._free == 100
+        async with budget.hold(100):
+            pass
+
+    asyncio.run(scenario())
 
 
 def test_an_engine_gives_its_memory_back(service):
-    engine = service.service.models.engine(service.service.models.candidate("ao"))
+    engine = service.engine()
     engine.shrink()
     trim()
     before = resident()
@@ -73,46 +93,40 @@ def test_an_engine_gives_its_memory_back(service):
     assert resident() - before < 0.2 * grown
 
 
-def test_an_idle_service_gives_its_memory_back(start, make_exr):
+def test_an_idle_service_gives_its_memory_back(start, make_exr, wait_until):
     local = start(idle_trim=0.1)
     calls = []
-    engine = local.service.models.engine(local.service.models.candidate("ao"))
+    engine = local.engine()
     shrink = engine.shrink
-    engine.shrink = lambda: (calls.append(time.monotonic()), shrink())
-    local.client.post(
-        "/shade/ao", content=make_exr(16, 16), headers={"Content-Type": "image/x-exr"}
-    )
-    deadline = time.monotonic() + 5
-    while not calls:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    time.sleep(0.3)
-    assert len(calls) == 1  # once, not again and again
+    engine.shrink = lambda: (calls.append(1), shrink())
+    for count in (1, 2):
+        local.client.post(
+            "/shade/ao", content=make_exr(16, 16), headers={"Content-Type": "image/x-exr"}
+        )
+        wait_until(lambda count=count: len(calls) == count)
+        local.run(asyncio.sleep(0.3))
+        assert len(calls) == count  # once, not again and again
 
 
 def test_the_part_with_the_most_pixels_counts(service, make_exr):
     """Not the widest one: either may turn out to be the one that is shaded."""
-    engine = service.service.models.engine(service.service.models.candidate("ao"))
-    wide, large = (exr.read_header(make_exr(*size)) for size in ((1, 101), (100, 100)))
-    alone = room_for([large], engine, 2**30)
-    together = room_for([wide, large], engine, 2**30)
-    assert together.needed > alone.needed
-    assert together.tile_bytes >= engine.bytes_per_pixel * 100 * 100
-    assert together.max_pixels(engine) >= 100 * 100
+    bundle = service.engine().bundle
+    wide, large = (exr.read_header(make_exr(*size)) for size in ((1, 501), (300, 300)))
+    alone = need_of([large], bundle, 2**30)
+    together = need_of([wide, large], bundle, 2**30)
+    assert together.total > alone.total
+    assert together.max_pixels == alone.max_pixels == 320 * 320
 
 
 def test_4k_stays_within_a_gibibyte_however_much_there_is(service, make_exr):
-    from types import SimpleNamespace
-
     part = exr.read_header(make_exr(2, 2, half=True)).parts[0]
     part = replace(part, data_window=(0, 0, 3839, 2159), decoded_bytes=2160 * 3840 * 12)
     header = exr.Header((part,), body_bytes=60 * 2**20)
-    bundle = service.service.models.engine(service.service.models.candidate("ao")).bundle
-    engine = SimpleNamespace(bundle=bundle, channels=6, bytes_per_pixel=150)
+    bundle = replace(service.engine().bundle, bytes_per_pixel=150)
     for total in (2**30, 2**33):
-        room = room_for([header], engine, total)
-        assert room.needed <= 2**30
-        assert room.max_pixels(engine) > 2**20
+        need = need_of([header], bundle, total)
+        assert need.total <= 2**30
+        assert need.max_pixels > 2**20
 
 
 def test_uploads_fit_the_machine(monkeypatch):
@@ -129,7 +143,7 @@ def test_uploads_fit_the_machine(monkeypatch):
         config.Settings(uploads=1000, limits=Limits(body_bytes=501))
 
 
-def test_what_a_derivation_takes_is_counted(service, make_exr, make_picture, monkeypatch):
+def test_what_a_derivation_takes_is_counted(service, make_exr, make_picture):
     """World-space attributes as half floats: read, converted, and beside them what they give."""
     import tracemalloc
 
@@ -142,9 +156,8 @@ def test_what_a_derivation_takes_is_counted(service, make_exr, make_picture, mon
         channels, half=True, compression="none", attributes={"worldToCamera": np.eye(4)}
     )
     header = exr.read_header(body)
-    engine = service.service.models.engine(service.service.models.candidate("ao"))
-    monkeypatch.setattr(engine, "bytes_per_pixel", 1)  # as if the network took nothing
-    needed = room_for([header], engine, 2**30).needed
+    bundle = replace(service.engine().bundle, bytes_per_pixel=1)  # as if it took nothing
+    needed = need_of([header], bundle, 2**30).total
     tracemalloc.start()
     load_gbuffer(body, ("normal", "position"), headers=[header])
     _, peak = tracemalloc.get_traced_memory()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import re
 import signal
 import subprocess
 import sys
@@ -15,22 +17,23 @@ from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DeepshadeError
 from deepshade_service.cli import listen
 from deepshade_service.config import Settings
+from deepshade_service.middleware import Counting
+from deepshade_service.telemetry import Telemetry
 
 
 def test_effects(client):
     effects = client.get("/effects").json()
     assert [effect["name"] for effect in effects] == list(EFFECTS)
     ao = client.get("/effects/ao").json()
-    assert ao == effects[0]
+    assert ao in effects
     assert [entry["attribute"] for entry in ao["inputs"]] == ["normal", "position"]
     (bundle,) = ao["bundles"]
     assert bundle["name"] == "tiny"
     assert bundle["metrics"] == {"error": {"test-real": {"exact": {"dssim": 0.25}}}}
     assert bundle["dssim"] == 0.25
     assert bundle["radius"] == 0.5
-    assert bundle["halo"] == bundle["background_halo"]
+    assert ao["settings"] == ["radius"]
     assert (bundle["engine"], bundle["precision"]) == ("onnxruntime", "fp32")
-    assert sum(backend["default"] for backend in bundle["backends"]) == 1
 
 
 def test_schema_and_pages(client):
@@ -40,6 +43,8 @@ def test_schema_and_pages(client):
     wanted = {
         "effect",
         "radius",
+        "focus",
+        "aperture",
         "fov",
         "profile",
         "map",
@@ -70,6 +75,25 @@ def test_metrics_count_by_route_not_by_path(client, make_exr):
     assert 'deepshade_stage_seconds_count{effect="ao",stage="infer"}' in text
     assert 'deepshade_computed_pixels_total{effect="ao"}' in text
     assert "deepshade_resident_bytes" in text
+
+
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_failure_is_counted_once(begun):
+    """Also one after the answer has begun, whose status is known by then."""
+    telemetry = Telemetry(queued=lambda: 0, held=lambda: 0)
+
+    async def broken(scope, receive, send):
+        if begun:
+            await send({"type": "http.response.start", "status": 200, "headers": []})
+        raise RuntimeError
+
+    async def send(message):
+        pass
+
+    with pytest.raises(RuntimeError):
+        asyncio.run(Counting(broken, telemetry)({"type": "http"}, None, send))
+    counted = re.findall(r'requests_total{.*status="(\d+)"} (\S+)', telemetry.render().decode())
+    assert counted == [("200" if begun else "500", "1.0")]
 
 
 def test_import_is_light():
@@ -156,6 +180,7 @@ def test_serve_without_models_folder_is_a_usage_error(tmp_path):
         (["--max-uploads", "1M", "--max-body", "1M"], "--max-uploads"),
         (["--models", "/nowhere"], "/nowhere"),
         (["--max-body", "much"], "'much'"),
+        (["--engine", "abacus"], "abacus"),
     ],
 )
 def test_wrong_options_are_no_tracebacks(models, capsys, options, message):

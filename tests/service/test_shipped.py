@@ -10,13 +10,10 @@ import pytest
 
 from deepshade import exr
 from deepshade.bundles import Bundle
-from deepshade.effects import EFFECTS
 from deepshade.engines import REFERENCE, load_engine
 from deepshade.gbuffer import load_gbuffer
 from deepshade_service import shading
 from deepshade_service.parameters import ShadeParameters
-from deepshade_service.planner import Plan, Scene
-from deepshade_service.tiles import plan_tiles
 
 MODELS = Path(__file__).parents[2] / "models"
 SHIPPED = sorted(path.parent for path in MODELS.glob("ao/*/config.json"))
@@ -34,12 +31,8 @@ def engine(request):
 
 def infer(engine, body, radius, max_pixels=10**9):
     gbuffer = load_gbuffer(body, engine.bundle.inputs)
-    height, width = gbuffer.shape
-    bundle = engine.bundle
-    tiling = plan_tiles(
-        height, width, multiple=bundle.size_multiple, halo=bundle.halo, max_pixels=max_pixels
-    )
-    return shading.infer(gbuffer, Plan(radius, "request", tiling), engine, threading.Event())
+    plan = shading.plan_shading(gbuffer, engine.bundle, ShadeParameters(radius=radius), max_pixels)
+    return shading.infer(gbuffer, plan, engine, threading.Event())
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (63, 65), (129, 257)])
@@ -56,36 +49,6 @@ def test_tiled_equals_untiled(engine, make_exr):
     whole, tiled = infer(engine, body, 0.5), infer(engine, body, 0.5, max_pixels=1)
     np.testing.assert_allclose(tiled, whole, atol=1e-5)
     assert whole.std() > 1e-3
-
-
-@pytest.mark.parametrize("shape", ["corner", "two", "ragged", "stripe"])
-def test_cropped_equals_whole(engine, make_exr, make_picture, shape):
-    """What the planner leaves out counts for nothing: the bundle's background halo is enough."""
-    bundle = engine.bundle
-    size = (600, 900) if bundle.background_halo < 200 else (700, 1300)
-    y, x = np.mgrid[0 : size[0], 0 : size[1]]
-    covered = {
-        "corner": (y < 90) & (x < 140),
-        "two": ((y < 80) & (x < 90)) | ((y > size[0] - 70) & (x > size[1] - 100)),
-        "ragged": (y < 90 + 60 * np.sin(x / 17)) & (x < size[1] // 3),
-        "stripe": (x > 37) & (x < 41),
-    }[shape]
-    steps = 1 + 0.1 * ((x // 20 + y // 20) % 2)  # in depth, so that there is something to shade
-    channels = {
-        name: np.where(covered, p * (steps if name.startswith("position") else 1), 0)
-        for name, p in make_picture(*size).items()
-    }
-    gbuffer = load_gbuffer(make_exr(channels), bundle.inputs)
-    scene = Scene(gbuffer, EFFECTS[bundle.effect])
-    plan = scene.plan(bundle, ShadeParameters(radius=0.5), 10**9)
-    assert plan.computed < 0.9 * covered.size
-    whole = plan_tiles(*size, multiple=bundle.size_multiple, halo=bundle.halo, max_pixels=10**9)
-    answers = [
-        shading.infer(gbuffer, Plan(0.5, "request", tiling), engine, threading.Event())
-        for tiling in (plan.tiling, whole)
-    ]
-    np.testing.assert_allclose(*answers, atol=1e-3)
-    assert answers[0][0, covered].std() > 1e-3
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e4])

@@ -13,7 +13,7 @@ from safetensors.numpy import save
 from deepshade.camera import Camera
 from deepshade.gbuffer.derivation import normals_from_positions
 from deepshade.manifest import Manifest, Shard
-from deepshade_trainer.networks import NetworkConfig
+from deepshade_trainer.networks import FoldConfig
 from deepshade_trainer.recipe import Recipe
 
 SIZE = 64
@@ -70,5 +70,7 @@ def data(tmp_path_factory: Any) -> Path:
 
 @pytest.fixture
 def recipe() -> Recipe:
-    network = NetworkConfig(widths=(8, 12), steps=(2,), down=(1, 1), up=(1,))
-    return Recipe(network=network, batch=4, steps=6, warmup=2, held_out=0.2, precision="fp32")
+    network = FoldConfig(
+        widths=(8, 12), steps=(2,), down=(1, 1), up=(1,), normal=0, position=3, bias=0.85
+    )
+    return Recipe(network=network, batch=4, steps=6, warmup=2, val_fraction=0.2, precision="fp32")

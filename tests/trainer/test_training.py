@@ -8,14 +8,17 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from deepshade.bundles import bundle_root
 from deepshade.errors import ConfigError, DataError
-from deepshade_trainer.recipe import PRESETS, Recipe, preset
+from deepshade_trainer.networks import from_bundle
+from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run
 from deepshade_trainer.training import train
 
@@ -29,7 +32,7 @@ def weights(run: Run) -> dict[str, torch.Tensor]:
 
 @pytest.mark.slow
 def test_it_learns(data: Path, tmp_path: Path, recipe: Recipe) -> None:
-    recipe = recipe.changed(steps=120, rate=4e-3)
+    recipe = recipe.changed(steps=120, lr=4e-3)
     steps = list(train(recipe, [data], Run(tmp_path / "run")))
     assert [p.step for p in steps] == list(range(1, 121))
     assert steps[-1].loss < 0.6 * steps[0].loss
@@ -60,7 +63,7 @@ def test_a_run_starts_from_another_ones_average(data: Path, tmp_path: Path, reci
     """Weights that both have are taken over; what only the new network has begins at random."""
     first, second = Run(tmp_path / "first"), Run(tmp_path / "second")
     list(train(recipe, [data], first))
-    changed = {"steps": 1, "rate": 1e-9, "decay": 0.0, "start": str(first.folder)}
+    changed = {"steps": 1, "lr": 1e-9, "weight_decay": 0.0, "init_from": str(first.folder)}
     *down, last = recipe.network.down
     (progress,) = train(
         recipe.changed(network={"down": [*down, last + 1]}, **changed), [data], second
@@ -72,16 +75,43 @@ def test_a_run_starts_from_another_ones_average(data: Path, tmp_path: Path, reci
         assert torch.allclose(taken[name], tensor, atol=1e-6), name
 
 
+def test_a_run_starts_from_a_bundle(data: Path, tmp_path: Path) -> None:
+    """Its weights go by their names; the padding of its stem is left out."""
+    recipe = preset("fast", "ao").changed(
+        steps=1, batch=2, lr=1e-9, weight_decay=0.0, precision="fp32"
+    )
+    folder = bundle_root() / "ao" / "fast"
+    found = list(train(recipe.changed(init_from=str(folder)), [data], Run(tmp_path)))
+    assert "at random" not in found[0].warning
+    given, taken = from_bundle(folder).network.state_dict(), weights(Run(tmp_path))
+    assert given.keys() == taken.keys()
+    for name, tensor in given.items():
+        assert torch.allclose(taken[name], tensor, atol=1e-6), name
+
+
+def test_training_in_a_thread_leaves_signals_alone(
+    data: Path, tmp_path: Path, recipe: Recipe
+) -> None:
+    """As a service does it: Python lets only the main thread set handlers."""
+    before = signal.getsignal(signal.SIGTERM)
+    with ThreadPoolExecutor(1) as pool:
+        steps = pool.submit(lambda: list(train(recipe, [data], Run(tmp_path)))).result()
+    assert len(steps) == recipe.steps
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
 def test_a_start_that_is_no_run_or_another_network_is_refused(
     data: Path, tmp_path: Path, recipe: Recipe
 ) -> None:
     with pytest.raises(ConfigError, match="no run to start from"):
-        next(train(recipe.changed(start=str(tmp_path)), [data], Run(tmp_path / "run")))
-    paper = preset("paper", "ao").changed(batch=recipe.batch, steps=1, held_out=0.0)
-    paper = paper.changed(network={"widths": [4, 8]})
+        next(train(recipe.changed(init_from=str(tmp_path)), [data], Run(tmp_path / "run")))
+    paper = preset("paper", "ao").changed(batch=recipe.batch, steps=1, val_fraction=0.0)
+    paper = paper.changed(network={"u0": 4, "levels": 2})
     list(train(paper, [data], Run(tmp_path / "paper")))
     with pytest.raises(ConfigError, match="no weights in common"):
-        next(train(recipe.changed(start=str(tmp_path / "paper")), [data], Run(tmp_path / "run")))
+        next(
+            train(recipe.changed(init_from=str(tmp_path / "paper")), [data], Run(tmp_path / "run"))
+        )
 
 
 @pytest.mark.slow
@@ -89,9 +119,10 @@ def test_a_killed_run_goes_on(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     settings = ["steps=100000", "batch=4", "precision=fp32"]
     settings += ["network.widths=[8,12]", "network.steps=[2]", "network.down=[1,1]"]
-    settings += ["network.up=[1]"]
+    settings += ["network.up=[1]", "network.rings=[1]", "network.fine_rings=[1]"]
+    settings += ["network.detail=[]"]
     command = [sys.executable, "-m", "deepshade.cli", "train", "ao", "--data", str(data)]
-    command += ["--out", str(out), *(x for s in settings for x in ("--set", s))]
+    command += ["--threads", "1", "--out", str(out), *(x for s in settings for x in ("--set", s))]
     for _ in range(2):
         before = Run(out).load()[1] if Run(out).checkpoint.exists() else 0
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
@@ -108,7 +139,7 @@ def test_a_killed_run_goes_on(data: Path, tmp_path: Path) -> None:
 
 def test_poisoned_batches_teach_nothing_and_are_named(tmp_path: Path, recipe: Recipe) -> None:
     data = write_data(tmp_path / "data", broken=(2, 9))
-    recipe = recipe.changed(steps=12, held_out=0.0)
+    recipe = recipe.changed(steps=12, val_fraction=0.0)
     warnings = [p.warning for p in train(recipe, [data], Run(tmp_path / "run")) if p.warning]
     assert warnings
     assert all("non-finite samples" in w and "shard-0000" in w for w in warnings)
@@ -120,7 +151,7 @@ def test_poisoned_batches_teach_nothing_and_are_named(tmp_path: Path, recipe: Re
 def test_another_recipe_does_not_resume(data: Path, tmp_path: Path, recipe: Recipe) -> None:
     list(train(recipe, [data], Run(tmp_path)))
     with pytest.raises(ConfigError, match="another recipe"):
-        list(train(recipe.changed(rate=0.1), [data], Run(tmp_path)))
+        list(train(recipe.changed(lr=0.1), [data], Run(tmp_path)))
     # More steps are the same run, longer.
     longer = list(train(recipe.changed(steps=8), [data], Run(tmp_path)))
     assert [p.step for p in longer] == [7, 8]
@@ -141,7 +172,7 @@ def test_too_little_data(data: Path, tmp_path: Path, recipe: Recipe) -> None:
 
 
 def test_presets_and_settings() -> None:
-    for name in PRESETS:
+    for name in ("fast", "balanced", "best", "paper", "paper-network"):
         assert preset(name, "ao").effect == "ao"
     paper = preset("paper", "ao")
     assert (paper.optimizer, paper.batch, paper.network.kind) == ("adadelta", 16, "paper")
@@ -162,7 +193,7 @@ def test_presets_and_settings() -> None:
         {"steps": "abc"},
         {"steps": 0},
         {"loss": "l9"},
-        {"held_out": 1.5},
+        {"val_fraction": 1.5},
         {"network": {"kind": "foo"}},
         {"network": {"widths": 8}},
         {"network": {"widths": [8, -1]}},
@@ -170,7 +201,7 @@ def test_presets_and_settings() -> None:
 )
 def test_settings_that_no_run_could_mean(change: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
-        preset("default", "ao").changed(**change)
+        preset("balanced", "ao").changed(**change)
 
 
 @pytest.mark.parametrize(

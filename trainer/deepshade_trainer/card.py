@@ -2,89 +2,92 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deepshade.bundles import METRICS, Bundle
-from deepshade.engines import REFERENCE, load_engine, usable
-from deepshade.errors import BundleError
+from deepshade.bundles import Bundle, write_config
+from deepshade.effects import EFFECTS
+from deepshade.engines import Backend, available, load_engine
 from deepshade.files import replacing
 from deepshade.machine import cpu_count, cpu_kind, describe
+from deepshade.tensors import channel_slices, up
+from deepshade_trainer.dataset import directions, lengths
 from deepshade_trainer.evaluation import Variant, evaluate, summary
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
 
 SPEED_SIZE = (768, 512)
-_BACKENDS = "## Engines and precision"
-# Normals need no 16-bit row: shards hold them so.
-VARIANTS = {
-    "exact": Variant(),
-    "16-bit positions": Variant(half=("position",)),
-    "normals 10 % too short": Variant(stretch=0.1),
-    "scene x 0.001": Variant(scale=1e-3),
-    "scene x 10000": Variant(scale=1e4),
-}
+MAX_INT8_ADDED = 0.01  # of the DSSIM in fp32
+_WRITTEN = ("path", "metrics", "hashes")
+_COLUMNS = {"ssim": ".4f", "psnr": ".2f", "mae": ".4f", "flip": ".4f", "smape": ".4f"}
+_COLUMNS |= {"dssim": ".4f", "trivial_dssim": ".4f", "ratio": ".3f"}
+
+
+def variants(bundle: Bundle) -> dict[str, Variant]:
+    """How a bundle's inputs are changed to see what it bears, by what its attributes are."""
+    found = {"exact": Variant()}
+    # Directions need no 16-bit row: shards hold them so.
+    if half := tuple(lengths(bundle.inputs)):
+        found["16-bit positions"] = Variant(half=half)
+    if directions(bundle.inputs):
+        found["normals 10 % too short"] = Variant(stretch=0.1)
+    if half:
+        found |= {f"scene x {scale:g}": Variant(scale=scale) for scale in (1e-3, 1e4)}
+    return found
 
 
 def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
-    """Add to its metrics: errors over each test folder, and what every backend here adds.
+    """The bundle with errors over each test folder and this machine's speed in its metrics.
 
-    `error` holds, for each folder, the summary under every variant of the inputs in fp32.
+    `error` holds, for each folder, the summary under every variant of the inputs in fp32, and in
+    the 16 and 8 bits of this machine. Where 8 bits add little error on all folders, they are
+    allowed on this kind of CPU.
     """
-    errors = {
-        folder.name: {
-            name: summary(list(evaluate(bundle, [folder], variant=variant)))
-            for name, variant in VARIANTS.items()
-        }
-        for folder in folders
-    }
-    found = _with_metrics(bundle, {"error": errors})
-    # Of real views, by habit: the backends take as long as all the variants.
-    return measure_backends(found, folders[-1])
+    errors: dict[str, dict[str, Any]] = {folder.name: {} for folder in folders}
+    for folder in folders:
+        found = errors[folder.name]
+        for name, variant in variants(bundle).items():
+            found[name] = summary(list(evaluate(bundle, [folder], variant=variant)))
+        for backend in _backends(bundle):
+            if backend.precision != "fp32":
+                mean = summary(list(evaluate(bundle, [folder], backend=backend)))
+                found[f"exact, {backend}"] = mean
+    kinds = set(bundle.int8_kinds) - {cpu_kind()}
+    added = [
+        mean["dssim"] / found["exact"]["dssim"] - 1
+        for found in errors.values()
+        for name, mean in found.items()
+        if name.endswith("/int8")
+    ]
+    if added and max(added) <= MAX_INT8_ADDED:
+        kinds.add(cpu_kind())
+    speeds = {**bundle.metrics.get("speed", {}), describe(): speed(bundle)}
+    metrics = {**bundle.metrics, "error": errors, "speed": speeds}
+    config = {f.name: getattr(bundle, f.name) for f in fields(bundle) if f.name not in _WRITTEN}
+    return write_config(bundle.path, {**config, "int8_kinds": sorted(kinds)}, metrics)
 
 
-def measure_backends(bundle: Bundle, folder: Path) -> Bundle:
-    """Add to its metrics the speed of every backend here, and what it adds to the error.
-
-    Under `backends`, by kind of CPU: the machine, milliseconds, and for the test folder each other
-    backend's summary, with `added`, its DSSIM over that in fp32 - 1. Other kinds' stay.
-    """
-    exact = summary(list(evaluate(bundle, [folder])))["dssim"]
-    tests: dict[str, Any] = {}
-    for backend in usable(bundle):
-        if backend != REFERENCE:
-            mean = summary(list(evaluate(bundle, [folder], backend=backend)))
-            tests[str(backend)] = {**mean, "added": mean["dssim"] / exact - 1}
-    here = {**speed(bundle), "tests": {folder.name: tests}}
-    others = bundle.metrics.get("backends", {})
-    kept = {kind: found for kind, found in others.items() if found.keys() >= here.keys()}
-    return _with_metrics(bundle, {"backends": {**kept, cpu_kind(): here}})
-
-
-def _with_metrics(bundle: Bundle, more: dict[str, Any]) -> Bundle:
-    found = {**bundle.metrics, **more}
-    with replacing(bundle.path / METRICS) as temporary:
-        temporary.write_text(json.dumps(found, indent=2) + "\n")
-    return dataclasses.replace(bundle, metrics=found)
+def _backends(bundle: Bundle) -> list[Backend]:
+    """The backends of this machine that run the bundle."""
+    return [backend for backend in available() if backend.precision != "int8" or bundle.int8]
 
 
 def speed(bundle: Bundle, repeats: int = 9) -> dict[str, Any]:
-    """Median milliseconds at `SPEED_SIZE` of each backend, in turns, and the machine."""
+    """Median milliseconds of the bare network at `SPEED_SIZE`, of each backend in turns."""
     width, height = SPEED_SIZE
-    step = bundle.size_multiple
-    rows, columns = -(-height // step) * step, -(-width // step) * step
+    rows, columns = up(height, bundle.size_multiple), up(width, bundle.size_multiple)
     rng = np.random.default_rng(0)
-    backends = usable(bundle)
+    gbuffer = rng.normal(size=(1, bundle.channels, rows, columns)).astype(np.float32)
+    if place := channel_slices(bundle.inputs, bundle.per_channel).get("position"):
+        gbuffer[:, place.stop - 1] = -np.abs(gbuffer[:, place.stop - 1]) - 4
+    backends = _backends(bundle)
     engines = [load_engine(bundle, backend, threads=cpu_count()) for backend in backends]
-    gbuffer = rng.normal(size=(1, engines[0].channels, rows, columns)).astype(np.float32)
-    gbuffer[:, 5:6] = -np.abs(gbuffer[:, 5:6]) - 4
     for engine in engines:
         engine.warm()
         engine.prepare(rows, columns)
@@ -96,97 +99,86 @@ def speed(bundle: Bundle, repeats: int = 9) -> dict[str, Any]:
             if turn > 1:
                 times[str(engine.backend)].append(1e3 * (time.perf_counter() - start))
     medians = {name: round(float(np.median(taken)), 2) for name, taken in times.items()}
-    return {"machine": describe(), "size": [width, height], "ms": medians}
+    return {"size": [width, height], "ms": medians}
 
 
 def write_card(bundle: Bundle, run: Run, note: str) -> None:
     """Write the bundle's README.md from its configuration, figures and recipe."""
-    recipe = Recipe.read(run.recipe)
+    effect = EFFECTS[bundle.effect]
     lines = [
         f"# {bundle.effect}/{bundle.name}",
         "",
-        f"Shades `{bundle.effect}` from {', '.join(bundle.inputs)}. "
-        f"Positions are divided by the effect radius ({bundle.radius:g} scene units unless the "
-        "request or the image's header names one), so any scene scale works.",
+        f"Shades `{bundle.effect}` from {', '.join(bundle.inputs)}."
+        + (
+            f" Lengths are divided by the effect radius ({bundle.radius:g} scene units unless the "
+            "request or the image's header names one), so any scene scale works."
+            if effect.lengths == "radius"
+            else " Lengths are divided by the picture's median depth."
+            if lengths(bundle.inputs)
+            else ""
+        ),
         "",
         f"Sides are padded to multiples of {bundle.size_multiple}; a pixel depends on at most "
         f"{bundle.halo} pixels around it.",
         "",
+        *_errors(bundle),
+        *_speeds(bundle),
     ]
-    errors = bundle.metrics.get("error", {})
-    if errors:
-        lines += [
-            "## Error",
-            "",
-            "Over views whose reference has a standard deviation of at least 0.12; the trivial "
-            "answer is all white.",
-            "",
-            "| test set | inputs | views | SSIM | PSNR | MAE | FLIP | DSSIM | trivial DSSIM "
-            "| ratio |",
-            "|---|---|---|---|---|---|---|---|---|---|",
-        ]
-        for name, variants in errors.items():
-            for inputs, mean in variants.items():
-                lines.append(
-                    f"| {name} | {inputs} | {mean['views']} | {mean['ssim']:.4f} "
-                    f"| {mean['psnr']:.2f} | {mean['mae']:.4f} | {mean['flip']:.4f} "
-                    f"| {mean['dssim']:.4f} | {mean['trivial_dssim']:.4f} "
-                    f"| {mean['ratio']:.3f} |"
-                )
-        lines += ["", *_backends(bundle)]
+    recipe = Recipe.read(run.recipe)
     # A path of this machine tells nobody anything; the folder's name is what the note speaks of.
-    recipe = recipe.changed(start=Path(recipe.start).name)
+    recipe = recipe.changed(init_from=Path(recipe.init_from).name)
     lines += ["## Recipe", "", "```json", json.dumps(asdict(recipe), indent=1), "```", ""]
     text = "\n".join(lines) + ("\n" + note.strip() + "\n" if note else "")
     with replacing(bundle.path / "README.md") as temporary:
         temporary.write_text(text)
 
 
-def refresh(bundle: Bundle, make: Callable[[], Bundle]) -> None:
-    """Write the table of backends in the bundle's card anew, after `make` has changed the figures.
-
-    All else in the bundle's README.md stays.
-
-    Raises:
-        BundleError: there is no card with such a table; nothing was made.
-    """
-    path = bundle.path / "README.md"
-    text = path.read_text() if path.is_file() else ""
-    before, heading, after = text.partition(_BACKENDS + "\n")
-    if not heading:
-        raise BundleError(f"{path} has no part '{_BACKENDS}'", fix="export the bundle again")
-    _, next_heading, rest = after.partition("\n## ")
-    lines = _backends(make())
-    with replacing(path) as temporary:
-        temporary.write_text(before + "\n".join(lines) + next_heading + rest)
-
-
-def _backends(bundle: Bundle) -> list[str]:
-    """Speed and error of every engine and precision, as a table for each kind of CPU."""
-    kinds: dict[str, Any] = bundle.metrics["backends"]
+def _errors(bundle: Bundle) -> list[str]:
+    """Error over each test set under every variant, beside the trivial answer's."""
+    errors: dict[str, dict[str, Any]] = bundle.metrics.get("error", {})
+    if not errors:
+        return []
+    effect = EFFECTS[bundle.effect]
+    measures = {
+        "deviation": "whose reference has a standard deviation of",
+        "dssim": "on which the trivial answer's DSSIM is",
+    }
+    trivial = f"`{effect.trivial}`" if isinstance(effect.trivial, str) else f"{effect.trivial:g}"
+    columns = [name for name in _COLUMNS if name in next(iter(errors.values()))["exact"]]
+    titles = [name.upper() if name not in ("trivial_dssim", "ratio") else name for name in columns]
     lines = [
-        _BACKENDS,
+        "## Error",
         "",
-        "Milliseconds of the network, and what each precision adds to the DSSIM of fp32, by what "
-        "the CPU multiplies 8 bits with.",
+        f"Over views {measures[effect.contrast]} at least {effect.min_contrast:g}; the trivial "
+        f"answer is {trivial} everywhere.",
         "",
+        f"| test set | inputs | views | {' | '.join(titles)} |".replace("_dssim", " DSSIM"),
+        "|---|---|---|" + "---|" * len(columns),
     ]
-    for kind, found in sorted(kinds.items()):
+    for name, found in errors.items():
+        for inputs, mean in found.items():
+            figures = " | ".join(f"{mean[column]:{_COLUMNS[column]}}" for column in columns)
+            lines.append(f"| {name} | {inputs} | {mean['views']} | {figures} |")
+    return [*lines, ""]
+
+
+def _speeds(bundle: Bundle) -> list[str]:
+    """The bare network's speed on each machine that it was measured on."""
+    speeds: dict[str, dict[str, Any]] = bundle.metrics.get("speed", {})
+    if not speeds:
+        return []
+    lines = [
+        "## Speed",
+        "",
+        "Milliseconds of the bare network.",
+        "",
+        "| machine | engine | precision | size | ms |",
+        "|---|---|---|---|---|",
+    ]
+    for machine, found in sorted(speeds.items()):
         width, height = found["size"]
-        tests: dict[str, Any] = found["tests"]
-        added = " | ".join(f"added on {name}" for name in tests)
-        lines += [
-            f"### {kind}: {found['machine']}",
-            "",
-            f"| engine | precision | ms at {width} x {height} | {added} |",
-            "|---|---|---|" + "---|" * len(tests),
-        ]
-        for name, milliseconds in sorted(found["ms"].items(), key=lambda item: item[1]):
+        for name, ms in sorted(found["ms"].items(), key=lambda item: item[1]):
             engine, _, precision = name.partition("/")
-            errors = [
-                f"{100 * test[name]['added']:+.2f} %" if name in test else "0"
-                for test in tests.values()
-            ]
-            lines.append(f"| {' | '.join([engine, precision, f'{milliseconds:.1f}', *errors])} |")
-        lines.append("")
-    return lines
+            size = f"{width} x {height}"
+            lines.append(f"| {machine} | {engine} | {precision} | {size} | {ms:.1f} |")
+    return [*lines, ""]

@@ -1,9 +1,8 @@
-"""`deepshade train`, `search`, `evaluate` and `export`."""
+"""`deepshade train`, `evaluate` and `export`."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +17,7 @@ def train(
     data: Data,
     out: Annotated[Path, typer.Option(help="Run folder; an existing run goes on.")],
     preset: Annotated[
-        str, typer.Option(help="fast, balanced, best, paper or paper-network.")
+        str, typer.Option(help="balanced or paper; ao has fast, best, paper-network.")
     ] = "balanced",
     settings: Annotated[
         list[str] | None,
@@ -36,15 +35,8 @@ def train(
     deepshade train ao --data data/ao --out runs/paper --preset paper --set steps=6000
     """
     import torch
+    from rich import progress as bars
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     from deepshade_trainer.recipe import preset as load_preset
     from deepshade_trainer.run import Run
@@ -55,14 +47,14 @@ def train(
     recipe = load_preset(preset, effect).changed(**_parse(settings or []))
     console = Console(stderr=True)
     columns = (
-        TextColumn("training"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[loss]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
+        bars.TextColumn("training"),
+        bars.BarColumn(),
+        bars.MofNCompleteColumn(),
+        bars.TextColumn("{task.fields[loss]}"),
+        bars.TimeElapsedColumn(),
+        bars.TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with bars.Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=recipe.steps, loss="")
         for progress in steps(recipe, data, Run(out), device=device):
             bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.4f}")
@@ -71,86 +63,10 @@ def train(
             if progress.figures:
                 console.print(
                     f"step {progress.step}: loss {progress.loss:.4f}  held-out DSSIM "
-                    f"{progress.figures['dssim']:.4f} ({progress.figures['ratio']:.3f} x all "
-                    f"white)  MAE {progress.figures['mae']:.4f}"
+                    f"{progress.figures['dssim']:.4f} ({progress.figures['ratio']:.3f} x the "
+                    f"trivial answer's)  MAE {progress.figures['mae']:.4f}"
                 )
     typer.echo(f"the run is in {out}")
-
-
-def search(
-    effect: Effect,
-    data: Data,
-    out: Annotated[Path, typer.Option(help="Search folder; an existing search goes on.")],
-    minutes: Annotated[float, typer.Option(help="Begin no trial after so long.", min=0)] = 60.0,
-    steps: Annotated[int, typer.Option(help="Training steps of a first trial.", min=1)] = 400,
-    most_ms: Annotated[
-        float, typer.Option(help="Leave out networks slower than this at 768 x 512.", min=0)
-    ] = 25.0,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Change one setting of the recipe: --set batch=4; repeatable."),
-    ] = None,
-    device: Annotated[str, typer.Option(help="'cpu' or 'cuda', for training.")] = "cpu",
-    threads: Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the frontier as JSON.")] = False,
-) -> None:
-    """Search for networks that are faster or more accurate. Ctrl-C stops; the same command goes on.
-
-    Each trial is trained a little and timed on this machine's fastest engine; those that no other
-    one beats at their speed are trained three times longer, up to three times over.
-
-    Examples:
-
-    deepshade search ao --data data/ao --out runs/search --minutes 600
-    """
-    import torch
-    from rich.console import Console
-    from rich.table import Column, Table
-
-    from deepshade.machine import cpu_count
-    from deepshade_trainer.recipe import preset as load_preset
-    from deepshade_trainer.search import frontier, label, read_trials
-    from deepshade_trainer.search import search as trials
-
-    if threads:
-        torch.set_num_threads(threads)
-    recipe = load_preset("balanced", effect).changed(**_parse(settings or []))
-    console = Console(stderr=True)
-    with console.status("searching") as status:
-        found = trials(
-            recipe,
-            data,
-            out,
-            minutes=minutes,
-            steps=steps,
-            most_ms=most_ms,
-            threads=threads or cpu_count(),
-            device=device,
-            report=lambda network, rung, progress: status.update(
-                f"rung {rung}, {label(network)}: step {progress.step} of {progress.steps}"
-            ),
-        )
-        for trial in found:
-            console.print(
-                f"rung {trial.rung}: {trial.ms:6.2f} ms  DSSIM {trial.dssim:.4f} "
-                f"({trial.ratio:.3f} x all white)  {trial.label}"
-            )
-    best = frontier(read_trials(out / "trials.jsonl"))
-    if as_json:
-        typer.echo(json.dumps([asdict(trial) for trial in best], indent=2))
-        return
-    figures = ("ms at 768 x 512", "DSSIM", "x all white", "rung", "parameters")
-    table = Table(*figures, Column("network", overflow="fold"))
-    for trial in best:
-        table.add_row(
-            f"{trial.ms:.2f}",
-            f"{trial.dssim:.4f}",
-            f"{trial.ratio:.3f}",
-            str(trial.rung),
-            f"{trial.parameters:,}",
-            trial.label,
-        )
-    Console().print(table)
 
 
 def evaluate(
@@ -158,24 +74,18 @@ def evaluate(
     data: Data,
     sheet: Annotated[Path | None, typer.Option(help="PNG contact sheet to write.")] = None,
     min_contrast: Annotated[
-        float, typer.Option(help="Leave out views whose reference varies less.")
-    ] = 0.12,
+        float | None,
+        typer.Option(help="Leave out views that show less; by default as the effect's row says."),
+    ] = None,
     limit: Annotated[int | None, typer.Option(help="Views at most.", min=1)] = None,
     half: Annotated[str, typer.Option(help="Attributes rounded to 16 bits, commas between.")] = "",
     scale: Annotated[float, typer.Option(help="Scale scene and radius by this.")] = 1.0,
     stretch: Annotated[
-        float, typer.Option(help="Shorten normals at random by up to this share.", min=0, max=0.99)
+        float,
+        typer.Option(help="Shorten directions at random by up to this share.", min=0, max=0.99),
     ] = 0.0,
     engine: Annotated[str, typer.Option(help="onnxruntime, openvino, …")] = "onnxruntime",
-    precision: Annotated[str, typer.Option(help="fp32, bf16, fp16 or int8.")] = "fp32",
-    card: Annotated[
-        bool,
-        typer.Option(
-            "--card",
-            help="Then measure every engine and precision here, on the last --data, and note it in "
-            "the bundle's metrics and card for this kind of CPU.",
-        ),
-    ] = False,
+    precision: Annotated[str, typer.Option(help="fp32, bf16 or int8.")] = "fp32",
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
 ) -> None:
     """Measure a bundle against references: SSIM, PSNR, MAE, FLIP of each view and the mean.
@@ -185,8 +95,6 @@ def evaluate(
       deepshade evaluate models/ao/balanced --data data/test --sheet out/sheet.png
 
       deepshade evaluate models/ao/fast --data data/test --engine openvino --precision bf16
-
-      deepshade evaluate models/ao/fast --data data/test --card
     """
     from rich.console import Console
     from rich.progress import track
@@ -194,8 +102,8 @@ def evaluate(
 
     from deepshade import pictures
     from deepshade.bundles import Bundle
+    from deepshade.effects import EFFECTS
     from deepshade.engines import Backend
-    from deepshade_trainer.card import measure_backends, refresh
     from deepshade_trainer.evaluation import Variant, contact_sheet, document, summary
     from deepshade_trainer.evaluation import evaluate as measure
 
@@ -208,10 +116,7 @@ def evaluate(
     )
     rows = list(track(shaded, "shading", console=noise, disable=not noise.is_terminal))
     if sheet is not None:
-        pictures.save(sheet, contact_sheet(rows[:24]))
-    if card:
-        with noise.status("measuring every engine and precision"):
-            refresh(found, lambda: measure_backends(found, data[-1]))
+        pictures.save(sheet, contact_sheet(EFFECTS[found.effect], rows[:24]))
     if as_json:
         typer.echo(json.dumps(document(found, rows, variant, backend)))
         return
@@ -224,26 +129,6 @@ def evaluate(
     listing.add_row(f"mean of {len(rows)}", *(f"{mean[name]:.4f}" for name in shown))
     Console().print(listing)
     typer.echo(f"DSSIM is {mean['ratio']:.3f} x the trivial answer's, on {backend}")
-
-
-def quantise(
-    bundle: Annotated[Path, typer.Argument(help="Bundle folder, such as models/ao/balanced.")],
-    data: Data,
-) -> None:
-    """Make a bundle's 8-bit graph anew, with the ranges that its numbers have on this data.
-
-    `export` makes one already. What it takes and costs is then unknown until it is measured:
-    deepshade evaluate models/ao/balanced --data data/test --card
-
-      deepshade quantise models/ao/balanced --data data/mine
-    """
-    from deepshade.bundles import Bundle
-    from deepshade_trainer.card import refresh
-    from deepshade_trainer.quantisation import requantise
-
-    found = Bundle.load(bundle)
-    refresh(found, lambda: requantise(found, data))
-    typer.echo(f"{bundle}: 8-bit graph made; next: deepshade evaluate {bundle} --card --data ...")
 
 
 def export(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from hashlib import sha256 as digest_of
 from pathlib import Path
 from queue import Queue
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from torch import Tensor
 
-from deepshade import symmetry
+from deepshade import symmetry, tensors
+from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.errors import DataError
 from deepshade.files import sha256
@@ -24,11 +26,11 @@ from deepshade.manifest import Manifest, shard_path
 
 Sample = dict[str, NDArray[np.float32]]
 
-# Shares of batches that see 16-bit positions, as renderers store them.
-HALF_POSITIONS = 0.3
-# Shares of batches whose normals are too short, as interpolation and filtering leave them.
-SHORT_NORMALS = 0.3
-SHORTEST = 0.8
+# Shares of samples whose lengths have 16 bits, as renderers store them.
+HALF_LENGTHS = 0.3
+# Shares of samples whose directions are too short, as interpolation and filtering leave them.
+SHORT_DIRECTIONS = 0.3
+MIN_DIRECTION = 0.8
 
 
 @dataclass(frozen=True)
@@ -56,11 +58,15 @@ class Dataset:
     def __init__(self, folders: Sequence[Path], effect: str) -> None:
         self.effect = EFFECTS[effect]
         self.reference = f"reference_{effect}"
+        trivial = self.effect.trivial
+        self.attributes = tuple(
+            dict.fromkeys([*self.effect.inputs, *([trivial] if isinstance(trivial, str) else [])])
+        )
         self.entries: list[Entry] = []
         self._open: dict[Path, Any] = {}
         for folder in folders:
             manifest = Manifest.read(folder)
-            missing = {*self.effect.inputs, self.reference} - set(manifest.schema)
+            missing = {*self.attributes, self.reference} - set(manifest.schema)
             if missing:
                 raise DataError(
                     f"{folder} has no {', '.join(sorted(missing))}",
@@ -74,21 +80,21 @@ class Dataset:
                     Entry(path, shard.sha256, k, r) for k, r in enumerate(shard.samples)
                 ]
 
-    def split(self, share: float, *, seed: int = 0) -> tuple[list[int], list[int]]:
+    def split(self, fraction: float, *, seed: int) -> tuple[list[int], list[int]]:
         """Sample numbers to train on and to validate on; no scene is in both.
 
-        Scenes are held out by a hash of their name, so more data doesn't move them; with a
-        `share` above 0 at least one is, where there are two.
+        Scenes are held out by a hash of their name and the run's seed, so more data doesn't move
+        them; with a `fraction` above 0 at least one is, where there are two.
         """
         hashes = [_unit(f"{seed}:{entry.record['scene']}") for entry in self.entries]
-        if share > 0 and len(set(hashes)) > 1:
-            share = max(share, float(np.nextafter(min(hashes), 1)))
-        held = [value < share for value in hashes]
+        if fraction > 0 and len(set(hashes)) > 1:
+            fraction = max(fraction, float(np.nextafter(min(hashes), 1)))
+        held = [value < fraction for value in hashes]
         training = [k for k, out in enumerate(held) if not out]
         return training, [k for k, out in enumerate(held) if out]
 
     def load(self, number: int) -> Sample:
-        """Sample `number`: planar float32 inputs in physical units, and its reference."""
+        """Sample `number`: planar float32 attributes in physical units, and its reference."""
         entry = self.entries[number]
         if entry.path not in self._open:
             if sha256(entry.path) != entry.digest:
@@ -101,44 +107,71 @@ class Dataset:
             except Exception as error:  # safetensors' own error type says only "invalid header"
                 raise DataError(f"{entry.path} can't be read: {error}") from error
         file = self._open[entry.path]
-        names = (*self.effect.inputs, self.reference)
+        names = (*self.attributes, self.reference)
         return {
             name: file.get_slice(name)[entry.index].astype(np.float32, copy=False) for name in names
         }
 
-    def gbuffer(self, sample: Sample, radius: float) -> NDArray[np.float32]:
-        """The network's input (C, H, W): positions in units of the effect radius."""
-        planes = [
-            sample[name] / np.float32(radius) if name == "position" else sample[name]
-            for name in self.effect.inputs
-        ]
-        return np.concatenate(planes)
+    def radius(self, number: int) -> float:
+        """The effect radius that a sample was rendered with; 1 for an effect without."""
+        return float(self.entries[number].record.get("radius", 1.0))
 
-    def batch(
-        self, numbers: Sequence[int], rng: np.random.Generator | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """G-buffers (N, C, H, W) and references (N, outputs, H, W).
+    def gbuffer(self, sample: Sample, radius: float, multiple: int = 1) -> NDArray[np.float32]:
+        """What a network sees of a sample (N, C, h, w); N is 3 for an effect run per channel.
 
-        With `rng`, each sample is turned by a random symmetry; some have 16-bit positions, some
-        normals that are too short.
+        Sides are padded to multiples of `multiple`.
         """
+        given, runs = (self.effect, sample, self.effect.inputs, radius), self.effect.per_channel
+        return tensors.tensor(*given, per_channel=runs, multiple=multiple)
+
+    def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+        """G-buffers (N, C, H, W) and references (N, outputs, H, W) to learn from.
+
+        Each sample is turned by one of the effect's symmetries; some have 16-bit lengths, some
+        directions that are too short; an effect run per channel sees one colour channel.
+        """
+        effect = self.effect
         inputs, references = [], []
         for number in numbers:
             sample = self.load(number)
-            turn = int(rng.integers(symmetry.COUNT)) if rng is not None else 0
-            half = rng is not None and bool(rng.random() < HALF_POSITIONS)
+            turn = effect.symmetries[int(rng.integers(len(effect.symmetries)))]
             turned = {
                 name: symmetry.apply(plane, None if name == self.reference else name, turn)
                 for name, plane in sample.items()
             }
-            if half and "position" in turned:
-                turned["position"] = rounded(turned["position"])
-            if rng is not None and "normal" in turned and rng.random() < SHORT_NORMALS:
-                lengths = rng.uniform(SHORTEST, 1, (1, *turned["normal"].shape[1:]))
-                turned["normal"] = turned["normal"] * lengths.astype(np.float32)
-            inputs.append(self.gbuffer(turned, float(self.entries[number].record["radius"])))
-            references.append(turned[self.reference])
+            if rng.random() < HALF_LENGTHS:
+                turned |= {name: rounded(turned[name]) for name in lengths(effect.inputs)}
+            if rng.random() < SHORT_DIRECTIONS:
+                turned |= shortened(turned, directions(effect.inputs), MIN_DIRECTION, rng)
+            channel = int(rng.integers(3)) if effect.per_channel else None
+            scale = tensors.length_scale(effect, turned, self.radius(number))
+            planes = tensors.planes(turned, effect.inputs, scale, channel=channel)
+            height, width = turned[self.reference].shape[1:]
+            inputs.append(tensors.cut(planes, (0, height, 0, width))[0])
+            some = slice(None) if channel is None else slice(channel, channel + 1)
+            references.append(turned[self.reference][some])
         return torch.from_numpy(np.stack(inputs)), torch.from_numpy(np.stack(references))
+
+
+def lengths(names: Iterable[str]) -> list[str]:
+    """Those attributes that are lengths."""
+    return [name for name in names if ATTRIBUTES[name].unit.scaled]
+
+
+def directions(names: Iterable[str]) -> list[str]:
+    """Those attributes that are unit vectors."""
+    return [name for name in names if ATTRIBUTES[name].unit.name.startswith("direction")]
+
+
+def shortened(
+    sample: Sample, names: Iterable[str], shortest: float, rng: np.random.Generator
+) -> Sample:
+    """These directions (3, H, W), each pixel's by a random factor from `shortest` to 1."""
+    found = {}
+    for name in names:
+        factors = rng.uniform(shortest, 1, (1, *sample[name].shape[1:]))
+        found[name] = sample[name] * factors.astype(np.float32)
+    return found
 
 
 def rounded(plane: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -205,16 +238,9 @@ def _chosen(numbers: Sequence[int], size: int, seed: int, step: int) -> list[int
     return chosen
 
 
-_orders: dict[tuple[int, int, int], NDArray[np.int64]] = {}
-
-
+@lru_cache(maxsize=4)
 def _permutation(count: int, seed: int, epoch: int) -> NDArray[np.int64]:
-    key = (count, seed, epoch)
-    if key not in _orders:
-        if len(_orders) > 4:
-            _orders.clear()
-        _orders[key] = np.random.default_rng([seed, epoch]).permutation(count)
-    return _orders[key]
+    return np.random.default_rng([seed, epoch]).permutation(count)
 
 
 def _unit(text: str) -> float:

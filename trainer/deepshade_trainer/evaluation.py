@@ -10,121 +10,126 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade import metrics, pictures
+from deepshade import judging, metrics, pictures
 from deepshade.bundles import Bundle
+from deepshade.effects import Effect
 from deepshade.engines import REFERENCE, Backend, load_engine
 from deepshade.errors import ConfigError, DataError
 from deepshade.machine import cpu_count
-from deepshade_trainer.dataset import Dataset, Sample, rounded
+from deepshade_trainer.dataset import Dataset, Sample, directions, lengths, rounded, shortened
 
 Image = NDArray[np.float32]
-FIGURES = ("ssim", "dssim", "psnr", "mae", "flip", "trivial_ssim", "trivial_dssim")
 
 
 @dataclass(frozen=True)
 class Variant:
     """How inputs are changed before shading, to see what that costs.
 
-    `half` names attributes rounded to 16 bits; `scale` multiplies the scene and the radius;
-    `stretch` multiplies normals by random lengths in [1 - stretch, 1].
+    `half` names attributes rounded to 16 bits; `scale` multiplies all lengths and the radius;
+    `stretch` multiplies directions by random lengths in [1 - stretch, 1].
     """
 
     half: tuple[str, ...] = ()
     scale: float = 1.0
     stretch: float = 0.0
 
-    def apply(self, sample: Sample, radius: float) -> tuple[Sample, float]:
+    def apply(self, sample: Sample, inputs: Sequence[str], radius: float) -> tuple[Sample, float]:
         """The changed inputs and radius; the reference stays."""
         changed = dict(sample)
         if self.scale != 1:
-            changed["position"] = changed["position"] * np.float32(self.scale)
+            factor = np.float32(self.scale)
+            changed |= {name: changed[name] * factor for name in lengths(inputs)}
         if self.stretch:
-            shape = (1, *changed["normal"].shape[1:])
-            lengths = np.random.default_rng(0).uniform(1 - self.stretch, 1, shape)
-            changed["normal"] = changed["normal"] * lengths.astype(np.float32)
-        for name in self.half:
-            changed[name] = rounded(changed[name])
+            rng = np.random.default_rng(0)
+            changed |= shortened(changed, directions(inputs), 1 - self.stretch, rng)
+        changed |= {name: rounded(changed[name]) for name in self.half}
         return changed, radius * self.scale
 
 
 @dataclass(frozen=True)
 class Row:
-    """One view's figures and pictures."""
+    """One view's figures, and its images as they are compared, in [0, 1].
+
+    `guide` shows its normals, or where the effect has none the trivial answer.
+    """
 
     scene: str
     contrast: float
     figures: dict[str, float]
-    normal: Image
     image: Image
     reference: Image
+    guide: pictures.Picture
 
 
 class Shaded:
-    """A bundle on an engine, for G-buffers of any size."""
+    """A bundle on an engine, for samples of any size."""
 
     def __init__(self, bundle: Bundle, backend: Backend = REFERENCE) -> None:
         self.bundle = bundle
         self.backend = backend
         self.engine = load_engine(bundle, backend, threads=cpu_count())
 
-    def __call__(self, gbuffer: Image) -> Image:
-        """Shade (C, H, W): zero-padded to the size multiple, cropped again."""
-        height, width = gbuffer.shape[1:]
-        step = self.bundle.size_multiple
-        pad = ((0, 0), (0, -height % step), (0, -width % step))
-        shaded: Image = self.engine.predict(np.pad(gbuffer, pad)[None])[0]
-        return shaded[:, :height, :width]
+    def __call__(self, data: Dataset, sample: Sample, radius: float) -> Image:
+        """The answer (C, H, W), C of an effect run per channel from three runs."""
+        height, width = sample[data.reference].shape[1:]
+        gbuffer = data.gbuffer(sample, radius, self.bundle.size_multiple)
+        shaded: Image = self.engine.predict(gbuffer)
+        return shaded.reshape(-1, *shaded.shape[2:])[:, :height, :width]
 
 
 def evaluate(
     bundle: Bundle,
     folders: Sequence[Path],
     *,
-    min_contrast: float = 0.12,
+    min_contrast: float | None = None,
     limit: int | None = None,
     variant: Variant | None = None,
     backend: Backend = REFERENCE,
 ) -> Iterator[Row]:
-    """Shade every sample whose reference has at least `min_contrast` standard deviation.
+    """Shade every sample that shows something: by default as much as the effect's row says.
 
     Raises:
-        DataError: no sample has.
+        DataError: no sample does.
         EngineError: this machine or this bundle lacks the backend.
     """
     data, shader = Dataset(folders, bundle.effect), Shaded(bundle, backend)
-    variant = variant or Variant()
+    effect, variant = data.effect, variant or Variant()
+    least = effect.min_contrast if min_contrast is None else min_contrast
     for name in variant.half:
         if name not in bundle.inputs:
             raise ConfigError(name, bundle.inputs, detail=f"{bundle.effect} has no input {name!r}")
     found = 0
     for number, entry in enumerate(data.entries):
         sample = data.load(number)
-        reference = np.clip(sample[data.reference], 0, 1)
-        contrast = float(reference.std())
-        if contrast < min_contrast:
+        reference = sample[data.reference]
+        blank = judging.trivial(effect, sample, reference)
+        contrast = judging.contrast(effect, reference, blank)
+        if contrast < least:
             continue
-        changed, radius = variant.apply(sample, float(entry.record["radius"]))
-        image = np.clip(shader(data.gbuffer(changed, radius)), 0, 1)
-        yield Row(
-            entry.record["scene"],
-            contrast,
-            compare(image, reference, np.full_like(reference, data.effect.background)),
-            sample["normal"],
-            image,
-            reference,
+        changed, radius = variant.apply(sample, effect.inputs, data.radius(number))
+        image = shader(data, changed, radius)
+        ours, truth, nothing = judging.exposed(effect, reference, image, reference, blank)
+        figures = compare(ours, truth, nothing)
+        if effect.is_light:
+            figures["smape"] = metrics.smape(image, reference)
+        guide = (
+            pictures.normals(sample["normal"])
+            if "normal" in sample
+            else pictures.of_effect(nothing, effect)
         )
+        yield Row(entry.record["scene"], contrast, figures, ours, truth, guide)
         found += 1
         if found == limit:
             return
     if not found:
         raise DataError(
-            f"no sample has a contrast of {min_contrast}",
+            f"no sample has a contrast of {least}",
             fix="render views that show more, or lower --min-contrast",
         )
 
 
 def compare(image: Image, reference: Image, trivial: Image) -> dict[str, float]:
-    """`FIGURES` of one image (C, H, W) in [0, 1]."""
+    """Figures of one image (C, H, W) in [0, 1]; of light, `smape` is added unclipped."""
     ssim, blank = metrics.ssim(image, reference), metrics.ssim(trivial, reference)
     return {
         "ssim": ssim,
@@ -139,23 +144,19 @@ def compare(image: Image, reference: Image, trivial: Image) -> dict[str, float]:
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Means over rows, and the ratio of mean DSSIM to the trivial answer's."""
-    mean = {name: float(np.mean([row.figures[name] for row in rows])) for name in FIGURES}
+    names = rows[0].figures
+    mean = {name: float(np.mean([row.figures[name] for row in rows])) for name in names}
     return {"views": len(rows), **mean, "ratio": mean["dssim"] / mean["trivial_dssim"]}
 
 
-def table(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """JSON-ready figures of each view."""
-    return [{"scene": r.scene, "contrast": r.contrast, **r.figures} for r in rows]
-
-
-def contact_sheet(rows: Sequence[Row], columns: int = 2) -> pictures.Picture:
-    """Views side by side, each as normals, our image, the reference, and the difference."""
+def contact_sheet(effect: Effect, rows: Sequence[Row], columns: int = 2) -> pictures.Picture:
+    """Views side by side, each as its guide, our image, the reference, and the difference."""
     strips = [
         pictures.beside(
             [
-                pictures.normals(row.normal),
-                pictures.shading(row.image),
-                pictures.shading(row.reference),
+                row.guide,
+                pictures.of_effect(row.image, effect),
+                pictures.of_effect(row.reference, effect),
                 pictures.difference(row.image, row.reference),
             ]
         )
@@ -178,5 +179,5 @@ def document(
         "precision": backend.precision,
         "inputs": asdict(variant),
         "mean": summary(rows),
-        "views": table(rows),
+        "views": [{"scene": r.scene, "contrast": r.contrast, **r.figures} for r in rows],
     }

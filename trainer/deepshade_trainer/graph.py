@@ -110,7 +110,7 @@ def bytes_per_pixel(model: Any, name: str, shape: tuple[int, int, int]) -> int:
     watched.graph.output.extend(onnx.ValueInfoProto(name=each) for each in names)
     session = ort.InferenceSession(watched.SerializeToString(), providers=["CPUExecutionProvider"])
     picture = np.zeros((1, *shape), np.float32)
-    sizes = {
+    sizes: dict[str, int] = {
         each: v.nbytes for each, v in zip(names, session.run(names, {name: picture}), strict=True)
     }
     sizes[name] = picture.nbytes

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -15,17 +16,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from deepshade import judging
+from deepshade.bundles import CONFIG, Bundle
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing
 from deepshade_trainer.dataset import Batch, Dataset, batches
 from deepshade_trainer.losses import dssim, parse_loss
-from deepshade_trainer.networks import Shader, build
+from deepshade_trainer.networks import Network, Shader, build, bundle_weights
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
 
-# Views whose reference varies less than this show nothing to judge (design, section 2).
-MIN_CONTRAST = {"ao": 0.12}
 SAVE_EVERY = 250
 VALIDATE_EVERY = 500
 VALIDATION_SAMPLES = 96
@@ -64,45 +65,48 @@ class _Trainer:
     def __init__(self, recipe: Recipe, folders: Sequence[Path], run: Run, device: str) -> None:
         self.recipe, self.run, self.device = recipe, run, torch.device(device)
         self.data = Dataset(folders, recipe.effect)
-        self.training, held = self.data.split(recipe.held_out, seed=recipe.seed)
+        self.training, held = self.data.split(recipe.val_fraction, seed=recipe.seed)
         if len(self.training) < recipe.batch:
             raise DataError(
                 f"{len(self.training)} samples don't fill a batch of {recipe.batch}",
                 fix="render more views, or train with a smaller --set batch=",
             )
         self.warnings: list[str] = []
-        self.held = self._telling(held)
+        self.held = self._judged(held)
         torch.manual_seed(recipe.seed)
-        background = EFFECTS[recipe.effect].background
-        self.model = build(recipe.network, background).to(self.device)
-        self.model = self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
-        self.optimizer = _optimizer(recipe, self.model)
+        self.network = build(recipe.network).to(self.device)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.shader = Shader(EFFECTS[recipe.effect], self.network)
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
+        self.optimizer = _optimizer(recipe, self.network)
         self.loss = parse_loss(recipe.loss)
         self.first = self._resume()
 
-    def _telling(self, held: list[int]) -> list[int]:
+    def _judged(self, held: list[int]) -> list[int]:
         """Up to `VALIDATION_SAMPLES` sound held-out samples that have something to show."""
-        least = MIN_CONTRAST.get(self.recipe.effect, 0.0)
+        effect = self.data.effect
         step = max(1, len(held) // (2 * VALIDATION_SAMPLES))
         found = []
         for number in held[::step]:
             sample = self.data.load(number)
             if not all(np.isfinite(plane).all() for plane in sample.values()):
                 self.warnings.append(f"not validated on: {self.data.entries[number].name}")
-            elif float(sample[self.data.reference].std()) >= least:
+                continue
+            reference = sample[self.data.reference]
+            blank = judging.trivial(effect, sample, reference)
+            if judging.contrast(effect, reference, blank) >= effect.min_contrast:
                 found.append(number)
-        if not found and self.recipe.held_out:
+        if not found and self.recipe.val_fraction:
             self.warnings.append(
                 f"nothing to validate on: none of {len(held)} held-out samples is sound and has "
-                f"a contrast of {least}"
+                f"a contrast of {effect.min_contrast}"
             )
         return found[:VALIDATION_SAMPLES]
 
     def _resume(self) -> int:
         if not self.run.checkpoint.exists():
-            if self.recipe.start:
-                self._begin_with(Run(Path(self.recipe.start)))
+            if self.recipe.init_from:
+                self._begin_with(Path(self.recipe.init_from))
             self.recipe.write(self.run.recipe)
             return 0
         begun = Recipe.read(self.run.recipe)
@@ -114,30 +118,29 @@ class _Trainer:
             )
         self.recipe.write(self.run.recipe)  # the number of steps may be another
         groups, step, optimizer = self.run.load()
-        self.model.load_state_dict(groups["model"])
+        self.network.load_state_dict(groups["model"])
         self.average = {k: v.to(self.device) for k, v in groups["average"].items()}
         self.optimizer.load_state_dict(optimizer)
         return step
 
-    def _begin_with(self, other: Run) -> None:
-        """Take another run's averaged weights, where it has such; the rest stays random."""
-        if not other.checkpoint.is_file():
-            raise ConfigError("start", detail=f"there is no run to start from in {other.folder}")
-        groups, _, _ = other.load()
-        own = self.model.state_dict()
-        known = {
-            name: weight
-            for name, weight in groups.get("average", {}).items()
-            if name in own and own[name].shape == weight.shape
-        }
+    def _begin_with(self, folder: Path) -> None:
+        """Take the weights of a bundle or a run's average, where known; the rest stays random."""
+        if (folder / CONFIG).is_file():
+            weights = bundle_weights(Bundle.load(folder))
+        elif Run(folder).checkpoint.is_file():
+            weights = Run(folder).load()[0].get("average", {})
+        else:
+            raise ConfigError("init_from", detail=f"{folder} is no run to start from, nor a bundle")
+        own = self.network.state_dict()
+        known = {k: w for k, w in weights.items() if k in own and own[k].shape == w.shape}
         if not known:
             raise ConfigError(
-                "start", detail=f"{other.folder} is of another network: no weights in common"
+                "init_from", detail=f"{folder} is of another network: no weights in common"
             )
-        self.model.load_state_dict({**own, **known})
-        self.average = {k: v.detach().clone() for k, v in self.model.state_dict().items()}
+        self.network.load_state_dict({**own, **known})
+        self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         if fresh := sorted(own.keys() - known.keys()):
-            self.warnings.append(f"not in {other.folder}, so begun at random: {', '.join(fresh)}")
+            self.warnings.append(f"not in {folder}, so begun at random: {', '.join(fresh)}")
 
     def steps(self, stopped: Callable[[], bool]) -> Iterator[Progress]:
         from torch.utils.tensorboard import SummaryWriter
@@ -187,94 +190,80 @@ class _Trainer:
         gbuffer, reference = batch.gbuffer.to(self.device), batch.reference.to(self.device)
         if not (torch.isfinite(gbuffer).all() and torch.isfinite(reference).all()):
             return math.nan, "non-finite samples"
-        self.model.train()
+        self.shader.train()
         mixed = recipe.precision == "bf16"
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
-            image = self.model(gbuffer)
-        loss = self.loss(image, reference)
+            image = self.shader.on_curve(gbuffer)
+        loss = self.loss(image, self.shader.curve(reference))
         self.optimizer.zero_grad(set_to_none=True)
         if not torch.isfinite(loss):
             return math.nan, f"loss {float(loss)}"
         loss.backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(self.model.parameters(), recipe.clip or math.inf)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), recipe.clip or math.inf)
         if not torch.isfinite(norm):
             return math.nan, f"gradient norm {float(norm)}"
-        rate = recipe.rate * _schedule(recipe, batch.step)
+        lr = recipe.lr * _schedule(recipe, batch.step)
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = lr
         self.optimizer.step()
         # A young average follows closely, or it would remember the random start.
         decay = min(recipe.ema, (1 + batch.step) / (10 + batch.step)) if recipe.ema else 0.0
         with torch.no_grad():
-            for name, value in self.model.state_dict().items():
+            for name, value in self.network.state_dict().items():
                 self.average[name].lerp_(value, 1 - decay)
         return float(loss.detach()), ""
 
     def _validate(self, log: Any, step: int) -> dict[str, float]:
         """Mean DSSIM and MAE of the averaged weights, beside the trivial answer's DSSIM."""
-        model = build(self.recipe.network, EFFECTS[self.recipe.effect].background)
-        model.load_state_dict({k: v.cpu() for k, v in self.average.items()})
-        model = model.to(self.device).eval()
-        trivial = EFFECTS[self.recipe.effect].background
+        effect = self.data.effect
+        network = build(self.recipe.network).to(self.device)
+        network.load_state_dict(self.average)
+        shader = Shader(effect, network).eval()
         rows: list[list[float]] = []
         pictures: list[Tensor] = []
-        with torch.inference_mode():
-            for number in self.held:
-                gbuffer, reference = self.data.batch([number])
-                image = model(gbuffer.to(self.device)).cpu()
-                blank = torch.full_like(reference, trivial)
-                rows.append(
-                    [
-                        float(dssim(image, reference)),
-                        float((image - reference).abs().mean()),
-                        float(dssim(blank, reference)),
-                    ]
-                )
-                if len(pictures) < 6:
-                    pictures.append(_side_by_side(gbuffer, image, reference))
+        for number in self.held:
+            sample = self.data.load(number)
+            gbuffer = torch.from_numpy(self.data.gbuffer(sample, self.data.radius(number)))
+            with torch.inference_mode():
+                answer = shader(gbuffer.to(self.device)).cpu().flatten(0, 1).numpy()
+            reference = sample[self.data.reference]
+            blank = judging.trivial(effect, sample, reference)
+            image, truth, nothing = (
+                torch.from_numpy(each)[None]
+                for each in judging.exposed(effect, reference, answer, reference, blank)
+            )
+            error = (image - truth).abs()
+            figures = dssim(image, truth), error.mean(), dssim(nothing, truth)
+            rows.append([float(figure) for figure in figures])
+            if len(pictures) < 6:
+                pictures.append(torch.cat([image, truth, error], 3)[0].expand(3, -1, -1))
         if not rows:
             return {}
         mean = np.mean(rows, axis=0)
-        figures = {
-            "dssim": float(mean[0]),
-            "mae": float(mean[1]),
-            "trivial_dssim": float(mean[2]),
-            "ratio": float(mean[0] / mean[2]),
-        }
-        for key, value in figures.items():
+        summary = dict(zip(("dssim", "mae", "trivial_dssim"), mean.tolist(), strict=True))
+        summary["ratio"] = summary["dssim"] / summary["trivial_dssim"]
+        for key, value in summary.items():
             log.add_scalar(f"validation/{key}", value, step)
-        log.add_image("normal, ours, reference, error", torch.cat(pictures, 1).numpy(), step)
+        log.add_image("ours, reference, error", torch.cat(pictures, 1).numpy(), step)
         history = json.loads(self.run.metrics.read_text()) if self.run.metrics.exists() else []
         history = [entry for entry in history if entry["step"] < step]
         with replacing(self.run.metrics) as temporary:
             temporary.write_text(
-                json.dumps([*history, {"step": step, **figures}], indent=1, allow_nan=False)
+                json.dumps([*history, {"step": step, **summary}], indent=1, allow_nan=False)
             )
-        return figures
+        return summary
 
     def _save(self, step: int) -> None:
-        groups = {"model": self.model.state_dict(), "average": self.average}
+        groups = {"model": self.network.state_dict(), "average": self.average}
         self.run.save(groups, step, self.optimizer.state_dict())
 
 
-def _side_by_side(gbuffer: Tensor, image: Tensor, reference: Tensor) -> Tensor:
-    """(3, H, 4 W): normals, our image, the reference, their difference."""
-    normal = gbuffer[0, :3] * 0.5 + 0.5
-    grey = [image[0], reference[0], (image[0] - reference[0]).abs()]
-    return torch.cat([normal, *(g.expand(3, -1, -1) for g in grey)], 2).clamp(0, 1)
-
-
-def _optimizer(recipe: Recipe, model: Shader) -> torch.optim.Optimizer:
-    if recipe.optimizer == "adamw":
-        return torch.optim.AdamW(
-            model.parameters(), recipe.rate, betas=(0.9, 0.99), weight_decay=recipe.decay
-        )
+def _optimizer(recipe: Recipe, network: Network) -> torch.optim.Optimizer:
+    weights, lr, decay = network.parameters(), recipe.lr, recipe.weight_decay
     if recipe.optimizer == "adadelta":
         # The paper's "momentum 0.9" is ADADELTA's decay of its running averages.
-        return torch.optim.Adadelta(
-            model.parameters(), recipe.rate, rho=0.9, weight_decay=recipe.decay
-        )
-    raise ConfigError(recipe.optimizer, ("adamw", "adadelta"))
+        return torch.optim.Adadelta(weights, lr, rho=0.9, weight_decay=decay)
+    return torch.optim.AdamW(weights, lr, betas=(0.9, 0.99), weight_decay=decay)
 
 
 def _schedule(recipe: Recipe, step: int) -> float:
@@ -289,7 +278,13 @@ def _schedule(recipe: Recipe, step: int) -> float:
 
 @contextmanager
 def _finish_on_signals() -> Iterator[Callable[[], bool]]:
-    """Turn Ctrl-C and SIGTERM into a request to save and stop after the current step."""
+    """Turn Ctrl-C and SIGTERM into a request to save and stop after the current step.
+
+    Only the main thread hears signals: elsewhere nothing is asked for.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
     asked = False
 
     def ask(*_: object) -> None:

@@ -1,95 +1,103 @@
-"""The networks: the paper's U-Net and ours, each from a small config.
-
-A `Shader` maps a G-buffer (N, C, H, W) as bundles define it (camera-space normals of any length,
-camera-space positions divided by the effect radius, zeros where there is no geometry) to an image
-(N, outputs, H, W). H and W are multiples of `size_multiple`. Nothing in it depends on the rest of
-the image beyond `halo` pixels, so that tiles equal the whole.
-"""
+"""The networks: the paper's and ours, each made from a small config of its own."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
-from torch import Tensor, nn
+import torch
+from torch import Tensor
 
-from deepshade_trainer.networks.receptive_field import Span
+from deepshade.bundles import Bundle
+from deepshade.effects import EFFECTS
+from deepshade.errors import ConfigError, DataError
+from deepshade_trainer.networks.chain import Chain, ChainConfig
+from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet
+from deepshade_trainer.networks.network import Network
+from deepshade_trainer.networks.paper_unet import PaperConfig, PaperUNet
+from deepshade_trainer.networks.shader import Shader
 
-KINDS = ("fold", "paper")
+__all__ = [
+    "FoldConfig",
+    "Network",
+    "NetworkConfig",
+    "Shader",
+    "build",
+    "bundle_weights",
+    "from_bundle",
+    "network_config",
+]
+
+NetworkConfig = ChainConfig | FoldConfig | PaperConfig
+
+_KINDS: dict[str, tuple[Any, Any]] = {
+    "chain": (ChainConfig, Chain),
+    "fold": (FoldConfig, FoldUNet),
+    "paper": (PaperConfig, PaperUNet),
+}
 
 
-@dataclass(frozen=True)
-class NetworkConfig:
-    """What a network is made of.
+def build(config: NetworkConfig) -> Network:
+    """The network that `config` describes, with random weights.
 
-    `kind` is "paper" or "fold". `widths` are the channels of each level, finest first. The paper's
-    has convolutions of `kernel` x `kernel`. Ours folds `fold` x `fold` pixels into channels, its
-    levels are `steps` times coarser than the one before, and have `down` convolutions of 3 x 3 on
-    the way down and `up` on the way up. Every level is told its `horizons`, found `rings` cells
-    away, the first `fine_rings`, and also those of its cells' quarters, `detail` quarters away,
-    unless that is empty. `normal` and `position` are the first of their three input channels, None
-    without them.
+    Raises ConfigError where its entries don't fit each other.
     """
-
-    kind: str = "fold"
-    inputs: int = 6
-    outputs: int = 1
-    widths: tuple[int, ...] = (48, 96, 128)
-    steps: tuple[int, ...] = (4, 2)
-    down: tuple[int, ...] = (1, 2, 2)
-    up: tuple[int, ...] = (2, 2)
-    fold: int = 4
-    rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
-    fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
-    detail: tuple[int, ...] = (1, 1)
-    kernel: int = 3
-    normal: int | None = 0
-    position: int | None = 3
+    made: Network = _KINDS[config.kind][1](config)
+    return made
 
 
-class Shader(nn.Module, ABC):
-    """Base of all networks. Called, it gives [0, 1] in evaluation mode, unbounded in training."""
+def network_config(settings: Mapping[str, Any], base: NetworkConfig | None = None) -> NetworkConfig:
+    """The configuration that `settings` give, which may come from JSON; the rest is `base`'s.
 
-    def __init__(self, config: NetworkConfig, background: float) -> None:
-        super().__init__()
-        self.config = config
-        self.background = background
-
-    @property
-    @abstractmethod
-    def size_multiple(self) -> int:
-        """Height and width must be multiples of this many pixels."""
-
-    @abstractmethod
-    def needs(self, pixel: int) -> Span:
-        """The input columns that the output column `pixel` depends on (rows are alike)."""
-
-    @property
-    def halo(self) -> int:
-        """How many pixels away an input may change an output, at most: exact, by construction."""
-        reach = 0
-        for pixel in range(self.size_multiple):
-            first, last = self.needs(pixel)
-            reach = max(reach, pixel - first, last - pixel)
-        return reach
-
-    @property
-    def background_halo(self) -> int:
-        """How many pixels of background around all geometry the answer may depend on, at most."""
-        return self.halo
-
-    @abstractmethod
-    def forward(self, gbuffer: Tensor) -> Tensor:
-        """(N, C, H, W) to (N, outputs, H, W) float32, `background` where there is no geometry."""
-
-
-def build(config: NetworkConfig, background: float = 1.0) -> Shader:
-    """Make the network that `config` describes.
-
-    Raises:
-        ConfigError: its entries don't fit each other.
+    Of a base of another kind only the inputs and outputs stay. Raises ConfigError for an unknown
+    kind or setting, and for values that no network could mean.
     """
-    from deepshade_trainer.networks.fold_unet import FoldUNet
-    from deepshade_trainer.networks.paper_unet import PaperUNet
+    kind = settings.get("kind", base.kind if base else None)
+    if kind not in _KINDS:
+        detail = f"no network {kind!r}, only {', '.join(_KINDS)}"
+        raise ConfigError(str(kind), _KINDS, detail=detail)
+    config = _KINDS[kind][0]
+    if base is None or base.kind != kind:
+        base = config(**({"inputs": base.inputs, "outputs": base.outputs} if base else {}))
+    known = {field.name for field in dataclasses.fields(config)}
+    for key in settings:
+        if key not in known:
+            raise ConfigError(key, known)
+    values: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()
+    }
+    return dataclasses.replace(base, **values)
 
-    return {"fold": FoldUNet, "paper": PaperUNet}[config.kind](config, background)
+
+def from_bundle(path: Path | str) -> Shader:
+    """A bundle's shader in PyTorch, with its weights, in evaluation mode.
+
+    Raises BundleError or DataError where the bundle or its weights don't fit.
+    """
+    bundle = Bundle.load(path)
+    network = build(network_config(bundle.network))
+    weights, own = bundle_weights(bundle), network.state_dict()
+    if wrong := [n for n, w in own.items() if n not in weights or weights[n].shape != w.shape]:
+        raise DataError(
+            f"{bundle.model} lacks the weights {', '.join(wrong)}", fix="export the bundle again"
+        )
+    network.load_state_dict({name: weights[name] for name in own})
+    return Shader(EFFECTS[bundle.effect], network).eval()
+
+
+def bundle_weights(bundle: Bundle) -> dict[str, Tensor]:
+    """A bundle's weights by the names that its network has for them."""
+    import onnx
+    from onnx import numpy_helper
+
+    own = build(network_config(bundle.network)).state_dict()
+    graph = onnx.load(str(bundle.model)).graph
+    found: dict[str, Tensor] = {}
+    for tensor in graph.initializer:
+        if tensor.name in own:
+            value = torch.from_numpy(numpy_helper.to_array(tensor).copy())
+            # The stem's may have one more input channel, all zeros: see `prepare_export`.
+            found[tensor.name] = value[:, : own[tensor.name].shape[1]] if value.ndim > 1 else value
+    return found

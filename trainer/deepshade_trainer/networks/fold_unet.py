@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import itertools
-import math
 import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deepshade.errors import ConfigError
-from deepshade_trainer.networks import NetworkConfig, Shader
-from deepshade_trainer.networks.horizons import directions, horizons, sampled, unit
+from deepshade_trainer.networks.horizons import covered, directions, horizons, sampled, unit
+from deepshade_trainer.networks.network import Network, check_types
 from deepshade_trainer.networks.receptive_field import Span, folded, grown, joined
 
 # Levels whose cells are this many pixels wide keep those without geometry at zero.
@@ -23,163 +23,142 @@ _MASKED = 16
 _TOLD = 5
 
 
-class FoldUNet(Shader):
-    """Our network: pixels folded into channels, dense convolutions, geometry at every scale.
+@dataclass(frozen=True)
+class FoldConfig:
+    """The shape of a `FoldUNet`.
 
-    The normals of `fold` x `fold` pixels become one cell. At every level each cell is told its
-    `horizons`: what occludes it; with `detail`, the finest also those of its four quarters, for
-    what is thinner than a cell. They are float32 arithmetic before the first convolution, so that
-    engines can run the convolutions in 16 or 8 bits while no large position ever matters to one.
-
-    Nothing has a bias where there is no geometry, and coarse cells without geometry are kept at
-    zero: to the pixels around it background is the same as the edge of the picture.
+    `fold` x `fold` pixels become a cell. `widths` are the channels of each level, finest first;
+    levels are `steps` times coarser than the one before, and have `down` convolutions of 3 x 3 on
+    the way down and `up` on the way up. `normal` and `position` are the first of their three input
+    channels; with both, every level is told its `horizons`, found `rings` cells away, the first
+    `fine_rings`, and also those of its cells' quarters, `detail` quarters away, unless that is
+    empty. `bias` is what the outputs begin at.
     """
 
-    def __init__(self, config: NetworkConfig, background: float) -> None:
-        super().__init__(config, background)
-        widths, cells = config.widths, config.fold**2
-        if config.normal is None or config.position is None:
-            raise ConfigError("kind", detail="the folded network needs normals and positions")
-        levels = len(config.widths)
-        if (len(config.down), len(config.up), len(config.steps)) != (
-            levels,
-            levels - 1,
-            levels - 1,
-        ):
+    kind: str = "fold"
+    inputs: int = 6
+    outputs: int = 1
+    widths: tuple[int, ...] = (48, 96, 128)
+    steps: tuple[int, ...] = (4, 2)
+    down: tuple[int, ...] = (1, 2, 2)
+    up: tuple[int, ...] = (2, 2)
+    fold: int = 4
+    rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
+    fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
+    detail: tuple[int, ...] = (1, 1)
+    normal: int | None = None
+    position: int | None = None
+    bias: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError where entries don't fit each other."""
+        check_types(self)
+        levels = len(self.widths)
+        if (len(self.down), len(self.up), len(self.steps)) != (levels, levels - 1, levels - 1):
             raise ConfigError(
                 "widths",
                 detail="down needs an entry for each of the widths, up and steps one fewer",
             )
         for name in ("rings", "fine_rings"):
-            if not (rings := getattr(config, name)) or min(rings) < 1:
+            if not (rings := getattr(self, name)) or min(rings) < 1:
                 raise ConfigError(name, detail=f"{name} are distances of 1 cell or more")
-        if config.detail and (min(config.detail) < 1 or config.fold % 2):
+        if self.detail and (min(self.detail) < 1 or self.fold % 2):
             raise ConfigError(
                 "detail", detail="detail are distances of 1 quarter or more, and need an even fold"
             )
-        place = config.position
+
+
+class FoldUNet(Network):
+    """Our network: pixels folded into channels, dense convolutions, geometry at every scale.
+
+    With normals and positions each cell is told its horizons at every level: what occludes it;
+    with `detail`, the finest also those of its four quarters, for what is thinner than a cell.
+    They are float32 arithmetic before the first convolution, so that engines can run the
+    convolutions in 16 bits while no large position ever matters to one. Nothing has a bias where
+    there is no geometry, and coarse cells without geometry are kept at zero: to the pixels around
+    it background is the same as the edge of the picture.
+
+    Without normals or positions there are no horizons, and all inputs are raw.
+    """
+
+    def __init__(self, config: FoldConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.geometric = config.normal is not None and config.position is not None
+        widths, fold = config.widths, config.fold
         # Raw positions are too large for a convolution in 16 bits; everything else is welcome.
-        self.raw = [k for k in range(config.inputs) if not place <= k < place + 3]
-        self.door = nn.Conv2d(len(self.raw), widths[0], config.fold, stride=config.fold, bias=False)
-        pairs = list(zip(itertools.pairwise(widths), config.steps, strict=True))
-        self.horizon = nn.Conv2d(directions(config.fine_rings), widths[0], 1, bias=False)
-        self.detail: nn.Conv2d | None = None
-        if config.detail:
-            self.detail = nn.Conv2d(directions(config.detail), widths[0], 2, stride=2, bias=False)
-            # small, so that a network trained without it can go on with it
-            nn.init.normal_(self.detail.weight, std=0.01)
-        told = _TOLD + directions(config.rings)
-        self.tell = nn.ModuleList(nn.Conv2d(told, width, 1, bias=False) for width in widths[1:])
+        raw = config.inputs - 3 if self.geometric else config.inputs
+        self.stem = nn.Conv2d(raw, widths[0], fold, stride=fold, bias=False)
+        if self.geometric:
+            near, around = directions(config.fine_rings), directions(config.rings)
+            self.horizon = nn.Conv2d(near, widths[0], 1, bias=False)
+            if config.detail:
+                quarters = directions(config.detail)
+                self.detail = nn.Conv2d(quarters, widths[0], 2, stride=2, bias=False)
+                # small, so that a network trained without it can go on with it
+                nn.init.normal_(self.detail.weight, std=0.01)
+            self.tell = nn.ModuleList(
+                nn.Conv2d(_TOLD + around, width, 1, bias=False) for width in widths[1:]
+            )
         self.encode = nn.ModuleList(map(_stack, widths, config.down))
-        self.shrink = nn.ModuleList(
+        pairs = list(zip(itertools.pairwise(widths), config.steps, strict=True))
+        self.downsample = nn.ModuleList(
             nn.Conv2d(fine, coarse, step, stride=step, bias=False) for (fine, coarse), step in pairs
         )
-        self.grow = nn.ModuleList(
+        self.upsample = nn.ModuleList(
             nn.ConvTranspose2d(coarse, fine, step, stride=step, bias=False)
             for (fine, coarse), step in pairs
         )
         self.decode = nn.ModuleList(map(_stack, widths[:-1], config.up))
-        self.head = nn.Conv2d(widths[0], config.outputs * cells, 3, padding=1)
+        self.head = nn.Conv2d(widths[0], config.outputs * fold**2, 3, padding=1)
         nn.init.normal_(self.head.weight, std=0.01)
-        nn.init.constant_(self.head.bias, 0.85)  # type: ignore[arg-type]
-
-    @property
-    def size_multiple(self) -> int:
-        """One cell of the coarsest level."""
-        return self._sizes[-1]
-
-    @property
-    def _sizes(self) -> list[int]:
-        """Pixels along a cell's side, at each level."""
-        return list(itertools.accumulate(self.config.steps, operator.mul, initial=self.config.fold))
-
-    @property
-    def background_halo(self) -> int:
-        """See `Shader.background_halo`.
-
-        What leaks into background must get out and back to matter. Unmasked levels let it go as far
-        as their convolutions reach; the finest masked level that convolves on the way up, as far
-        as those after its last mask: two cells if their number is even, else one.
-        """
-        config = self.config
-        levels = list(zip(self._sizes, config.down, (*config.up, 0), strict=True))
-        masked = [n > 0 and size >= _MASKED for n, size in enumerate(self._sizes)]
-        leak = config.fold
-        leak += sum(
-            size * (down + up)
-            for (size, down, up), quiet in zip(levels, masked, strict=True)
-            if not quiet
-        )
-        for n, (size, down, up) in enumerate(levels):
-            if not masked[n]:
-                continue
-            last = n + 1 == len(levels)
-            if count := down if last else up:
-                leak += size * (2 - count % 2)
-                break
-            leak += size if last else 0
-        return math.ceil(leak / 2 / self.size_multiple) * self.size_multiple
-
-    def needs(self, pixel: int) -> Span:
-        """See `Shader.needs`."""
-        config = self.config
-        span = grown((pixel // config.fold, pixel // config.fold), 1)
-        skips = []
-        for step, count in zip(config.steps, config.up, strict=True):
-            span = grown(span, count)
-            skips.append(span)
-            span = span[0] // step, span[1] // step
-        pixels = (pixel, pixel)
-        for n in reversed(range(len(config.widths))):
-            if n < len(skips):
-                span = joined(folded(span, config.steps[n]), skips[n])
-            span = grown(span, config.down[n])
-            size = self._sizes[n]
-            first, last = grown(span, max(config.rings if n else config.fine_rings))
-            pixels = joined(pixels, (self._sampled_at(first, size), self._sampled_at(last, size)))
-        if config.detail:
-            half = grown(folded(span, 2), max(config.detail))
-            pixels = joined(pixels, (half[0] * config.fold // 2, half[1] * config.fold // 2))
-        return joined(pixels, folded(span, config.fold))
-
-    def _sampled_at(self, cell: int, size: int) -> int:
-        """The pixel that stands for a cell of `size` pixels: see `features`."""
-        fold = self.config.fold
-        return cell * size + size // fold // 2 * fold + fold // 2
+        nn.init.constant_(self.head.bias, config.bias)  # type: ignore[arg-type]
 
     def forward(self, gbuffer: Tensor) -> Tensor:
-        """See `Shader.forward`."""
-        with _full_precision():
-            near, nearest, told, masks = self.features(gbuffer)
-        place, weight = self.config.position or 0, self.door.weight
-        if place + 3 == gbuffer.shape[1]:
-            # All that is raw comes first. An odd number of channels would be slower in 16 bits.
-            raw = gbuffer[:, : place + place % 2]
-            weight = torch.cat([weight, torch.zeros_like(weight[:, : place % 2])], 1)
-        else:
-            raw = torch.cat([gbuffer[:, :place], gbuffer[:, place + 3 :]], 1)
-        x = F.conv2d(raw, weight, stride=self.config.fold)
-        x = x + self.horizon(near)
-        if self.detail is not None:
-            x = x + self.detail(nearest)
+        """See `Network.forward`."""
+        config = self.config
+        x = self._stem(gbuffer)  # (N, widths[0], H / fold, W / fold)
+        told: list[Tensor] = []
+        masks: list[Tensor | None] = [None] * len(config.widths)
+        if self.geometric:
+            with _full_precision():
+                near, nearest, told, masks = self.features(gbuffer)
+            x = x + self.horizon(near)
+            if nearest is not None:
+                x = x + self.detail(nearest)
         x = F.relu(x)
         skips = []
         for n, stack in enumerate(self.encode):
             if n:
-                x = F.relu(self.shrink[n - 1](x) + self.tell[n - 1](told[n - 1]))
+                x = self.downsample[n - 1](x)  # (N, widths[n], h / step, w / step)
+                x = F.relu(x + self.tell[n - 1](told[n - 1]) if told else x)
             x = stack(x, masks[n])
             skips.append(x)
         for n in reversed(range(len(self.decode))):
-            x = F.relu(skips[n] + self.grow[n](x))
+            x = F.relu(skips[n] + self.upsample[n](x))  # (N, widths[n], step h, step w)
             x = self.decode[n](x, masks[n])
         # bf16 has only 1/256 between 0.5 and 1, where most of an occlusion image lies.
         with _full_precision():
-            image = self.head(x.to(self.head.weight.dtype)).float()
-            if not self.training:
-                image = image.clamp(0, 1)
-            image = F.pixel_shuffle(image, self.config.fold)
-            covered = _covered(gbuffer[:, place + 2 : place + 3])
-            return (image - self.background) * covered + self.background
+            x = self.head(x.to(self.head.weight.dtype)).float()  # (N, outputs fold², h, w)
+            return F.pixel_shuffle(x, config.fold)  # (N, outputs, H, W)
+
+    def _stem(self, gbuffer: Tensor) -> Tensor:
+        """All but positions, folded: (N, C, H, W) to (N, widths[0], H / fold, W / fold)."""
+        raw, weight, place = gbuffer, self.stem.weight, self.config.position or 0
+        if self.geometric and place + 3 == gbuffer.shape[1]:
+            # All that is raw comes first. An odd number of channels would be slower in 16 bits.
+            raw = gbuffer[:, : place + place % 2]
+            if weight.shape[1] < raw.shape[1]:
+                weight = F.pad(weight, (0, 0, 0, 0, 0, 1))
+        elif self.geometric:
+            raw = torch.cat([gbuffer[:, :place], gbuffer[:, place + 3 :]], 1)
+        return F.conv2d(raw, weight, stride=self.config.fold)
+
+    def prepare_export(self) -> None:
+        """Pad the stem's weights where `_stem` does: the graph then holds them by their name."""
+        place = self.config.position or 0
+        if self.geometric and place + 3 == self.config.inputs and place % 2:
+            self.stem.weight = nn.Parameter(F.pad(self.stem.weight, (0, 0, 0, 0, 0, 1)))
 
     def features(
         self, gbuffer: Tensor
@@ -188,7 +167,8 @@ class FoldUNet(Shader):
 
         Returns the first level's horizons (N, `directions`, h, w); those of its cells' quarters
         (N, `directions`, 2h, 2w), or None without `detail`; for each level but the first what its
-        cells are told; and for each level its mask of cells with geometry, or None.
+        cells are told (N, 5 + `directions`, h, w); and for each level its mask of cells with
+        geometry (N, 1, h, w), or None.
         """
         config = self.config
         start, place = config.normal or 0, config.position or 0
@@ -198,11 +178,11 @@ class FoldUNet(Shader):
         # One pixel stands for its cell. A mean would lie in the air where a cell shows an edge.
         nearest = None
         if config.detail:
-            quarters = _seen(sampled(six, config.fold // 2, 0))
+            quarters = _seen(sampled(six, config.fold // 2, 0))  # (N, 7, 2h, 2w)
             nearest = horizons(quarters, config.detail)
             seen = sampled(quarters, 2)
         else:
-            seen = _seen(sampled(six, config.fold))
+            seen = _seen(sampled(six, config.fold))  # (N, 7, h, w)
         cells = seen[:, 6:]
         told: list[Tensor] = []
         masks: list[Tensor | None] = [None]
@@ -215,16 +195,51 @@ class FoldUNet(Shader):
             masks.append((cells * 1e6).clamp(0, 1) if size >= _MASKED else None)
         return horizons(seen, config.fine_rings), nearest, told, masks
 
+    @property
+    def size_multiple(self) -> int:
+        """One cell of the coarsest level."""
+        return self._sizes[-1]
+
+    @property
+    def _sizes(self) -> list[int]:
+        """Pixels along a cell's side, at each level."""
+        return list(itertools.accumulate(self.config.steps, operator.mul, initial=self.config.fold))
+
+    def receptive_field(self, pixel: int) -> Span:
+        """See `Network.receptive_field`."""
+        config = self.config
+        span = grown((pixel // config.fold, pixel // config.fold), 1)
+        skips = []
+        for step, count in zip(config.steps, config.up, strict=True):
+            span = grown(span, count)
+            skips.append(span)
+            span = span[0] // step, span[1] // step
+        pixels = (pixel, pixel)
+        for n in reversed(range(len(config.widths))):
+            if n < len(skips):
+                span = joined(folded(span, config.steps[n]), skips[n])
+            span = grown(span, config.down[n])
+            if self.geometric:
+                first, last = grown(span, max(config.rings if n else config.fine_rings))
+                size = self._sizes[n]
+                pixels = joined(
+                    pixels, (self._sampled_at(first, size), self._sampled_at(last, size))
+                )
+        if self.geometric and config.detail:
+            half = grown(folded(span, 2), max(config.detail))
+            pixels = joined(pixels, (half[0] * config.fold // 2, half[1] * config.fold // 2))
+        return joined(pixels, folded(span, config.fold))
+
+    def _sampled_at(self, cell: int, size: int) -> int:
+        """The pixel that stands for a cell of `size` pixels: see `features`."""
+        fold = self.config.fold
+        return cell * size + size // fold // 2 * fold + fold // 2
+
 
 def _seen(six: Tensor) -> Tensor:
     """Normals and positions (N, 6, h, w) as `horizons` takes them: (N, 7, h, w)."""
     normal, position = torch.split(six, 3, 1)
-    return torch.cat([unit(normal), position, _covered(position[:, 2:])], 1)
-
-
-def _covered(z: Tensor) -> Tensor:
-    """1 where there is geometry, of the same shape; nearer than 1e-4 radii nothing can be."""
-    return (z * -1e4).clamp(0, 1)
+    return torch.cat([unit(normal), position, covered(position[:, 2:])], 1)
 
 
 class Stack(nn.ModuleList):

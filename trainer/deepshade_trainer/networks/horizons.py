@@ -21,7 +21,7 @@ _TURNS = (
     ((1, 1), (1, -1), (-1, -1), (-1, 1)),
 )
 # Points count in full up to about half a radius, and not at all from _GONE radii on: as the sweep
-# of our own horizon-based rivals found best.
+# of our own horizon-based baselines found best.
 _GONE, _FADE = 1.6, 0.9
 _AWAY = 1e4  # effect radii
 
@@ -41,10 +41,10 @@ def horizons(cells: Tensor, rings: Sequence[int], together: bool = False) -> Ten
     nothing but speed: engines are quicker with one neighbour at a time where there are many cells,
     and with all of them at once where there are few.
     """
-    normals, across, depth, covered = torch.split(cells, [3, 2, 1, 1], 1)
+    normals, across, depth, coverage = torch.split(cells, [3, 2, 1, 1], 1)
     normal = torch.split(normals, 1, 1)
     # Nothing is near what is far behind the camera: neither background nor the picture's edge.
-    here = torch.cat([across, depth + (covered * -_AWAY + _AWAY)], 1)
+    here = torch.cat([across, depth + (coverage * -_AWAY + _AWAY)], 1)  # (N, 3, h, w)
     margin = max(rings)
     wide = F.pad(here, (margin, margin, margin, margin), value=_AWAY)
     neighbours = [
@@ -78,6 +78,11 @@ def unit(vectors: Tensor) -> Tensor:
     """(N, 3, h, w) scaled to length 1; zeros stay zeros."""
     x, y, z = torch.split(vectors, 1, 1)
     return vectors * torch.rsqrt(x * x + y * y + z * z + 1e-12)
+
+
+def covered(z: Tensor) -> Tensor:
+    """1 where there is geometry, of the same shape; nearer than 1e-4 radii nothing can be."""
+    return (z * -1e4).clamp(0, 1)
 
 
 def sampled(x: Tensor, size: int, pixel: int | None = None) -> Tensor:

@@ -24,16 +24,3 @@ def folded(span: Span, factor: int) -> Span:
 def joined(a: Span, b: Span) -> Span:
     """The run that holds both."""
     return min(a[0], b[0]), max(a[1], b[1])
-
-
-def through_u(span: Span, levels: int, reach: int) -> Span:
-    """What a U of `levels` needs, whose convolutions reach `reach` pixels a level and side."""
-    skips = []
-    for _ in range(levels - 1):
-        span = grown(span, reach)
-        skips.append(span)
-        span = doubled(span)
-    span = grown(span, reach)
-    for skip in reversed(skips):
-        span = grown(joined(folded(span, 2), skip), reach)
-    return span

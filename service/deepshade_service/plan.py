@@ -1,0 +1,108 @@
+"""What one answer takes: the plan, as `?explain=1` answers it, and as facts for headers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from deepshade import exr
+from deepshade.effects import EFFECTS, SETTINGS
+from deepshade.gbuffer import GBuffer
+from deepshade_service.memory import Need
+from deepshade_service.parameters import LENS, ShadeParameters
+from deepshade_service.selection import Selection
+from deepshade_service.tiles import Tile
+
+Json = dict[str, Any]
+Facts = dict[str, str | float | int]
+
+# Which parameters a plan repeats: those that chose.
+_ASKED = ("quality", "bundle", "max_error", "budget_ms", "engine", "precision")
+
+
+@dataclass(frozen=True, slots=True)
+class ShadePlan:
+    """What will be computed: at which radius (scene units), in which tiles, all of one `shape`."""
+
+    radius: float
+    radius_source: str
+    shape: tuple[int, int]
+    tiles: tuple[Tile, ...]
+
+    @property
+    def computed(self) -> int:
+        """Pixels that the network computes, overlaps and padding included."""
+        return len(self.tiles) * prod(self.shape)
+
+
+def explain(
+    gbuffer: GBuffer,
+    headers: Sequence[exr.Header],
+    selection: Selection,
+    asked: ShadeParameters,
+    plan: ShadePlan,
+    need: Need,
+) -> Json:
+    """The plan as JSON values: what `?explain=1` answers and an answer's header holds."""
+    bundle, (height, width) = selection.bundle, gbuffer.shape
+    return {
+        "effect": bundle.effect,
+        "asked": {name: v for name in _ASKED if (v := getattr(asked, name)) is not None},
+        "reason": selection.reason,
+        "bundle": bundle.name,
+        "bundle_sha256": bundle.sha256,
+        "engine": selection.backend.engine,
+        "precision": selection.backend.precision,
+        "dssim": bundle.dssim,
+        **_settings(gbuffer, bundle.effect, plan),
+        "pixels": {
+            "width": width,
+            "height": height,
+            "background": int(np.count_nonzero(gbuffer.background)),
+            "computed": plan.computed,
+            "tiles": len(plan.tiles),
+            "tile": list(plan.shape),
+        },
+        "channels": {
+            "in_file": sum(len(header.channels()) for header in headers),
+            "decoded": list(dict.fromkeys(name for _, name in gbuffer.decoded)),
+        },
+        "memory_bytes": need.total,
+    }
+
+
+def facts_of(gbuffer: GBuffer, plan: ShadePlan, made: Json) -> Facts:
+    """How an answer was made, for its EXR header and the response's headers.
+
+    `made` is the plan as JSON. What isn't known is left out.
+    """
+    names = ("effect", "bundle", "bundle_sha256", "engine", "precision", "dssim", "radius")
+    facts = {name: made.get(name) for name in (*names, "radius_source", *LENS)}
+    return {name: fact for name, fact in facts.items() if fact is not None} | {
+        "mapped": _listed(gbuffer.mapped),
+        "derived": _listed(gbuffer.derived),
+        "background_pixels": made["pixels"]["background"],
+        "nonfinite_pixels": int(gbuffer.nonfinite),
+        "computed_pixels": plan.computed,
+        "tiles": len(plan.tiles),
+    }
+
+
+def _settings(gbuffer: GBuffer, effect: str, plan: ShadePlan) -> Json:
+    """Those that the effect has."""
+    known = EFFECTS[effect].settings
+    found: Json = {}
+    if "radius" in known:
+        found |= {"radius": plan.radius, "radius_source": plan.radius_source}
+    for name in LENS:
+        if name in known and (value := gbuffer.header.get(SETTINGS[name].header)) is not None:
+            found[name] = value if isinstance(value, float) else str(value)
+    return found
+
+
+def _listed(entries: dict[str, str]) -> str:
+    return "; ".join(f"{name}: {how}" for name, how in sorted(entries.items()))

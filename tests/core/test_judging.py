@@ -1,0 +1,45 @@
+"""What answers are judged beside: closed forms, and light that is judged alike at any exposure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deepshade import judging, metrics
+from deepshade.effects import EFFECTS
+
+
+def test_the_trivial_answer_is_a_number_or_an_input() -> None:
+    reference = np.zeros((3, 4, 5), np.float32)
+    light = np.random.default_rng(0).random((3, 4, 5), np.float32)
+    assert (judging.trivial(EFFECTS["dof"], {"light": light}, reference) == light).all()
+    assert (judging.trivial(EFFECTS["ao"], {}, reference[:1]) == 1).all()
+    assert (judging.trivial(EFFECTS["gi"], {}, reference) == 0).all()
+
+
+def test_occlusion_shows_something_where_it_varies() -> None:
+    reference = np.float32([[[0, 0, 1, 1]]])
+    assert judging.contrast(EFFECTS["ao"], reference, np.ones_like(reference)) == 0.5
+    assert judging.contrast(EFFECTS["ao"], np.ones_like(reference), np.ones_like(reference)) == 0
+
+
+@pytest.mark.parametrize("factor", [1e-20, 1e-3, 1e5, 1e20])
+def test_light_is_judged_alike_at_any_exposure(factor: float) -> None:
+    rng = np.random.default_rng(0)
+    effect = EFFECTS["dof"]
+    reference, blank = rng.random((2, 3, 32, 32), np.float32)
+    once = judging.contrast(effect, reference, blank)
+    brighter = [(image * np.float32(factor)).astype(np.float32) for image in (reference, blank)]
+    assert judging.contrast(effect, *brighter) == pytest.approx(once, rel=1e-4)
+    white = np.percentile(reference, 99)
+    by_hand = (np.clip(image / white, 0, 1) for image in (blank, reference))
+    assert once == pytest.approx(metrics.dssim(*by_hand), rel=1e-4)
+
+
+def test_what_is_compared_is_finite_and_in_range() -> None:
+    reference = np.full((3, 8, 8), 1e-29, np.float32)
+    firefly = np.full((3, 8, 8), 3e38, np.float32)
+    for image in judging.exposed(EFFECTS["dof"], reference, reference, firefly, -firefly):
+        assert np.isfinite(image).all()
+        assert image.min() >= 0
+        assert image.max() <= 1

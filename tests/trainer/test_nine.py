@@ -1,0 +1,107 @@
+"""Every row of the table of effects can be learnt and exported; nothing knows their names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+import torch
+
+from deepshade import tensors
+from deepshade.bundles import Bundle
+from deepshade.effects import EFFECTS
+from deepshade_trainer.dataset import Dataset
+from deepshade_trainer.evaluation import evaluate
+from deepshade_trainer.export import load_shader
+from deepshade_trainer.networks import Shader, build, from_bundle
+from deepshade_trainer.run import Run
+
+from .synthetic import RADIUS, arrays, make_bundle, small, write_data
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_a_batch_has_the_channels_of_its_network(effect: str, tmp_path: Path) -> None:
+    """Of an effect run per channel one colour channel, its own, drawn anew for each sample."""
+    row, data = EFFECTS[effect], Dataset([write_data(tmp_path, effect)], effect)
+    channels = tensors.channel_count(row.inputs, row.per_channel)
+    shader = Shader(row, build(small(effect, "balanced").network))
+    assert channels == shader.channels
+    gbuffer, reference = data.batch([0] * 24, np.random.default_rng(0))
+    assert gbuffer.shape == (24, channels, 64, 64)
+    assert reference.shape == (24, 1 if row.per_channel else len(row.outputs), 64, 64)
+    truth = data.load(0)[data.reference]
+    if row.per_channel:  # turned or not, a channel's values stay its own
+        sorts = [np.sort(plane.ravel()) for plane in truth]
+        seen = {
+            next(k for k, sort in enumerate(sorts) if (np.sort(one.numpy().ravel()) == sort).all())
+            for one in reference
+        }
+        assert seen == {0, 1, 2}
+    whole = data.gbuffer(data.load(0), RADIUS)
+    assert whole.shape == (3 if row.per_channel else 1, channels, 64, 64)
+    assert np.isfinite(whole).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["paper", "balanced"])
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_every_effect_trains_and_exports(effect: str, name: str, tmp_path: Path) -> None:
+    bundle = Bundle.load(make_bundle(effect, tmp_path, name).path)
+    row = EFFECTS[effect]
+    assert bundle.inputs == row.inputs
+    assert bundle.outputs == row.outputs
+    assert bundle.per_channel == row.per_channel
+    before, after = build(small(effect, name).network), from_bundle(bundle.path)
+    names = before.state_dict().keys()
+    assert names == after.network.state_dict().keys()
+    _, trained = load_shader(Run(tmp_path / "runs" / effect / name))
+    for key, weight in trained.network.state_dict().items():
+        assert torch.equal(weight, after.network.state_dict()[key]), key
+    # an odd size, half of it empty, light up to 1e5
+    gbuffer = tensors.tensor(
+        row,
+        arrays(effect, 99, 53, 71),
+        bundle.inputs,
+        RADIUS,
+        per_channel=bundle.per_channel,
+        multiple=bundle.size_multiple,
+    )
+    session = ort.InferenceSession(str(bundle.model), providers=["CPUExecutionProvider"])
+    (shade,) = session.run([bundle.output_name], {bundle.input_name: gbuffer})
+    with torch.inference_mode():
+        expected = after(torch.from_numpy(gbuffer)).numpy()
+    assert (np.abs(shade - expected) <= 1e-5 * np.maximum(1, np.abs(expected))).all()
+    lowest, highest = row.range
+    assert lowest is None or shade.min() >= lowest
+    assert highest is None or shade.max() <= highest
+    if isinstance(row.background, float):
+        assert shade[:, :, :26] == pytest.approx(row.background, abs=1e-6)
+    if row.per_channel:  # three runs at once are three single runs
+        single = [session.run(None, {bundle.input_name: one[None]})[0][0] for one in gbuffer]
+        assert np.abs(np.stack(single) - shade).max() <= 1e-5 * max(1, np.abs(shade).max())
+    rows = list(evaluate(bundle, [tmp_path / "data" / effect], limit=2))
+    figures: dict[str, Any] = rows[0].figures
+    assert all(np.isfinite(value) for value in figures.values())
+    assert ("smape" in figures) == row.is_light
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_what_is_learnt_is_the_answer_on_its_curve(effect: str) -> None:
+    """In training nothing is clamped; the answer is its curve's inverse, and finite."""
+    row = EFFECTS[effect]
+    torch.manual_seed(0)
+    shader = Shader(row, build(small(effect, "balanced").network)).train()
+    gbuffer = tensors.tensor(
+        row, arrays(effect, 3), row.inputs, RADIUS, per_channel=row.per_channel
+    )
+    image = shader.on_curve(torch.from_numpy(gbuffer))
+    answer = shader(torch.from_numpy(gbuffer))
+    assert torch.isfinite(answer).all()
+    expected = torch.expm1(image) if row.transfer == "log" else image
+    # beyond expm1's slope at 80 float32 ends
+    assert torch.allclose(answer[image.abs() < 10], expected[image.abs() < 10])
+    answer.clamp(-1, 1).mean().backward()
+    assert all(p.grad is None or torch.isfinite(p.grad).all() for p in shader.network.parameters())

@@ -1,0 +1,64 @@
+"""What all networks have in common, and how their configurations are checked."""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import ABC, abstractmethod
+from typing import Any
+
+from torch import Tensor, nn
+
+from deepshade.errors import ConfigError
+from deepshade_trainer.networks.receptive_field import Span
+
+
+class Network(nn.Module, ABC):
+    """Base of all networks: a G-buffer (N, C, H, W) in, an image (N, outputs, H, W) out.
+
+    Unbounded, and no part of it is set apart as background: see `Shader`. H and W are multiples
+    of `size_multiple`. An output depends on the inputs of its `receptive_field` alone, so that
+    tiles equal the whole.
+    """
+
+    @property
+    @abstractmethod
+    def size_multiple(self) -> int:
+        """Height and width must be multiples of this many pixels."""
+
+    @abstractmethod
+    def receptive_field(self, pixel: int) -> Span:
+        """The input columns that the output column `pixel` depends on (rows are alike)."""
+
+    @abstractmethod
+    def forward(self, gbuffer: Tensor) -> Tensor:
+        """(N, C, H, W) to (N, outputs, H, W)."""
+
+    @property
+    def halo(self) -> int:
+        """How many pixels away an input may change an output, at most: exact, by construction."""
+        reach = 0
+        for pixel in range(self.size_multiple):
+            first, last = self.receptive_field(pixel)
+            reach = max(reach, pixel - first, last - pixel)
+        return reach
+
+    def prepare_export(self) -> None:
+        """Lay the weights out as engines like them best; the answer stays."""
+
+
+def check_types(settings: Any) -> None:
+    """Raise ConfigError for a field of a settings dataclass that isn't of its default's type."""
+    for field in dataclasses.fields(settings):
+        default, value = field.default, getattr(settings, field.name)
+        if default is dataclasses.MISSING or (default is None and value is None):
+            continue
+        wanted: Any = (int, float) if isinstance(default, float) else type(default)
+        if default is None:
+            wanted = int
+        good = isinstance(value, wanted) and not isinstance(value, bool)
+        if isinstance(value, tuple):
+            good = good and all(type(v) is int and v >= 0 for v in value)
+        if not good:
+            raise ConfigError(
+                field.name, detail=f"{field.name} can't be {value!r}, it is like {default!r}"
+            )

@@ -1,0 +1,91 @@
+"""A network with all that surrounds it, alike in training, evaluation and export."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from deepshade import transfer
+from deepshade.attributes import ATTRIBUTES, RADIANCE
+from deepshade.effects import Effect
+from deepshade.errors import ConfigError
+from deepshade.tensors import channel_slices
+from deepshade_trainer.networks.horizons import covered
+from deepshade_trainer.networks.network import Network
+
+
+class Shader(nn.Module):
+    """A G-buffer (N, C, H, W), as `deepshade.tensors` makes it, to the effect's answer.
+
+    The network sees light through the effect's transfer curve and answers on it. Where the
+    effect's background is a number, that number stands where there is no surface. In evaluation
+    mode the answer is kept within the effect's range; in training nothing is clamped.
+    """
+
+    def __init__(self, effect: Effect, network: Network) -> None:
+        super().__init__()
+        self.effect, self.network = effect, network
+        self.places = channel_slices(effect.inputs, effect.per_channel)
+        self.lights = [
+            self.places[name] for name in effect.inputs if ATTRIBUTES[name].unit is RADIANCE
+        ]
+        self.background: float | None = None  # on the curve
+        if isinstance(effect.background, float):
+            self.background = float(self.curve(torch.tensor(effect.background)))
+            if not {"position", "depth"} & set(effect.inputs):
+                raise ConfigError(
+                    effect.name, detail=f"no input of '{effect.name}' says where background is"
+                )
+
+    @property
+    def channels(self) -> int:
+        """Of a G-buffer."""
+        return int(max(place.stop for place in self.places.values()))
+
+    @property
+    def size_multiple(self) -> int:
+        """See `Network.size_multiple`."""
+        return self.network.size_multiple
+
+    @property
+    def halo(self) -> int:
+        """See `Network.halo`."""
+        return self.network.halo
+
+    def forward(self, gbuffer: Tensor) -> Tensor:
+        """(N, C, H, W) to the answer (N, outputs, H, W), float32, in physical units."""
+        image: Tensor = transfer.inverse(self.on_curve(gbuffer), self.effect.transfer, torch)
+        unbounded = self.training or self.effect.range == (None, None)
+        return image if unbounded else image.clamp(*self.effect.range)
+
+    def on_curve(self, gbuffer: Tensor) -> Tensor:
+        """(N, C, H, W) to the answer on the transfer curve (N, outputs, H, W): what is learnt."""
+        image: Tensor = self.network(self._seen(gbuffer)).float()
+        if self.background is None:
+            return image
+        return (image - self.background) * self._coverage(gbuffer) + self.background
+
+    def curve(self, image: Tensor) -> Tensor:
+        """Light or answers through the transfer curve."""
+        seen: Tensor = transfer.forward(image, self.effect.transfer, torch)
+        return seen
+
+    def _seen(self, gbuffer: Tensor) -> Tensor:
+        """The G-buffer with its light on the curve."""
+        if not self.lights or self.effect.transfer == "linear":
+            return gbuffer
+        pieces = [gbuffer[:, place] for place in self.places.values()]
+        return torch.cat(
+            [
+                self.curve(piece) if place in self.lights else piece
+                for piece, place in zip(pieces, self.places.values(), strict=True)
+            ],
+            1,
+        )
+
+    def _coverage(self, gbuffer: Tensor) -> Tensor:
+        """(N, 1, H, W): 1 where there is a surface, else 0."""
+        if "position" in self.places:
+            last = self.places["position"].stop
+            return covered(gbuffer[:, last - 1 : last])
+        return covered(-gbuffer[:, self.places["depth"]])

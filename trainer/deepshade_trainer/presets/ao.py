@@ -1,0 +1,35 @@
+"""Ambient occlusion."""
+
+from deepshade_trainer.presets.paper import PAPER
+
+_NETWORK = {"kind": "paper", "u0": 8, "levels": 6}
+_BIAS = 0.85  # the mean of an occlusion image, or so
+
+PRESETS = {
+    "fast": {
+        "network": {
+            "widths": (32, 64, 64),
+            "steps": (4, 2),
+            "down": (0, 2, 2),
+            "up": (1, 2),
+            "rings": (1, 1, 2, 2),
+            "fine_rings": (1, 2, 4),
+            "detail": (),
+            "bias": _BIAS,
+        }
+    },
+    "balanced": {"network": {"bias": _BIAS}},
+    "best": {
+        "network": {
+            "widths": (64, 96, 128, 160),
+            "steps": (2, 2, 2),
+            "down": (1, 2, 3, 3),
+            "up": (2, 2, 3),
+            "fine_rings": (1, 1, 2, 2, 4, 4, 8, 8),
+            "bias": _BIAS,
+        }
+    },
+    "paper": {**PAPER, "network": _NETWORK},
+    # The paper's network, trained our way: what its shape costs, apart from its recipe.
+    "paper-network": {"network": _NETWORK},
+}
