@@ -222,7 +222,7 @@ def test_mock_transport(make_exr):
     assert answer.facts == {"radius": "2", "radius_source": "request"}
     np.testing.assert_array_equal(answer.channels()["Y"], shade)
     assert [request.url.path for request in mock.requests] == ["/shade/ao", "/shade/dof"]
-    assert dict(mock.requests[0].url.params) == {"quality": "fast", "budget_ms": "3.0"}
+    assert dict(mock.requests[0].url.params) == {"quality": "fast", "budget_ms": "3"}
     assert mock.requests[1].content == b"hello"
 
     async def work():
