@@ -7,7 +7,7 @@ import shutil
 import socket
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +16,7 @@ import typer
 from deepshade.errors import BundleError
 from deepshade.extras import installed, missing_packages, packages
 from deepshade.llvm import FIX as LLVM_FIX
-from deepshade.llvm import find_libllvm, libllvm_version
+from deepshade.llvm import OLDEST, find_libllvm, libllvm_version
 from deepshade.machine import cpu_count, cpu_quota, memory_bytes
 
 _GIB = 1024**3
@@ -24,7 +24,10 @@ _GIB = 1024**3
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding. A failed `required` check makes `deepshade doctor` exit with 1."""
+    """One finding. A failed `required` check makes `deepshade doctor` exit with 1.
+
+    `fix` says what to do if it failed.
+    """
 
     name: str
     ok: bool
@@ -50,14 +53,14 @@ def doctor(
 
 def run_checks(checks: Sequence[Callable[[], list[Check]]] | None = None) -> list[Check]:
     """Every check's findings."""
-    return [check for function in (checks or _CHECKS) for check in function()]
+    found = [check for function in (checks or _CHECKS) for check in function()]
+    return [replace(check, fix="") if check.ok else check for check in found]
 
 
 def check_python() -> list[Check]:
     """Whether Python is new enough."""
     version = ".".join(map(str, sys.version_info[:3]))
-    ok = sys.version_info >= (3, 11)
-    return [Check("python", ok, True, version, "" if ok else "install Python 3.11 or newer")]
+    return [Check("python", sys.version_info >= (3, 11), True, version, "install 3.11 or newer")]
 
 
 def check_packages() -> list[Check]:
@@ -68,7 +71,7 @@ def check_packages() -> list[Check]:
         name = f"extra '{extra}'" if extra else "core packages"
         detail = f"missing: {', '.join(lacking)}" if lacking else "all installed"
         fix = f"pip install 'deepshade[{extra}]'" if extra else "pip install deepshade"
-        checks.append(Check(name, not lacking, not extra, detail, fix if lacking else ""))
+        checks.append(Check(name, not lacking, not extra, detail, fix))
     return checks
 
 
@@ -76,15 +79,16 @@ def check_llvm() -> list[Check]:
     """Whether libLLVM is found, which Mitsuba renders with; required if Mitsuba is installed."""
     needed = installed("mitsuba")
     path = find_libllvm()
+    version = libllvm_version(path) if path else None
+    too_old = version is not None and version < OLDEST  # named by the environment
     if path is None:
         wrong = os.environ.get("DRJIT_LIBLLVM_PATH")
         detail = f"DRJIT_LIBLLVM_PATH names no file: {wrong}" if wrong else "none from 17 on found"
-        return [Check("libLLVM", False, needed, detail, LLVM_FIX)]
-    version = libllvm_version(path)
-    if version is not None and version < 17:  # named by the environment
-        detail = f"{path} is version {version}; Mitsuba needs 17 or newer"
-        return [Check("libLLVM", False, needed, detail, LLVM_FIX)]
-    return [Check("libLLVM", True, needed, f"{path}" + (f" ({version})" if version else ""))]
+    elif too_old:
+        detail = f"{path} is version {version}; Mitsuba needs {OLDEST} or newer"
+    else:
+        detail = f"{path} ({version})" if version else str(path)
+    return [Check("libLLVM", path is not None and not too_old, needed, detail, LLVM_FIX)]
 
 
 def check_shared_memory(path: Path = Path("/dev/shm")) -> list[Check]:
@@ -92,7 +96,7 @@ def check_shared_memory(path: Path = Path("/dev/shm")) -> list[Check]:
     if not path.is_dir():
         return [Check("shared memory", True, False, "no /dev/shm on this system")]
     total = shutil.disk_usage(path).total
-    fix = "" if total >= _GIB else "docker run --shm-size=2g … (compose: shm_size: 2g)"
+    fix = "docker run --shm-size=2g … (compose: shm_size: 2g)"
     return [Check("shared memory", total >= _GIB, False, f"{total / _GIB:.1f} GiB in {path}", fix)]
 
 
@@ -102,16 +106,9 @@ def check_machine() -> list[Check]:
     cpus = f"{cpu_count()} usable of {os.cpu_count()}" + (f", quota {quota:g}" if quota else "")
     memory = memory_bytes()
     enough = memory == 0 or memory >= 2 * _GIB
-    return [
-        Check("CPUs", True, False, cpus),
-        Check(
-            "memory",
-            enough,
-            False,
-            f"{memory / _GIB:.1f} GiB" if memory else "unknown",
-            "" if enough else "give the machine or container at least 2 GiB",
-        ),
-    ]
+    detail = f"{memory / _GIB:.1f} GiB" if memory else "unknown"
+    fix = "give the machine or container at least 2 GiB"
+    return [Check("CPUs", True, False, cpus), Check("memory", enough, False, detail, fix)]
 
 
 def check_engines() -> list[Check]:
@@ -126,7 +123,7 @@ def check_engines() -> list[Check]:
     for backend in found:
         listed.setdefault(backend.engine, []).append(backend.precision)
     detail = "; ".join(f"{engine} ({', '.join(kinds)})" for engine, kinds in listed.items())
-    fix = "" if found else "pip install 'deepshade[service]'"
+    fix = "pip install 'deepshade[service]'"
     return [Check("engines", bool(found), installed("fastapi"), detail or "none", fix)]
 
 
@@ -135,21 +132,16 @@ def check_bundles(root: Path | None = None) -> list[Check]:
     from deepshade.bundles import Bundle, bundle_folders, bundle_root
 
     root = root or bundle_root()
-    folders = bundle_folders(root)
-    if not folders:
-        return [
-            Check("models", False, False, f"none in {root}", "deepshade export, or get models/")
-        ]
     checks = []
-    for folder in folders:
+    for folder in bundle_folders(root):
         name = f"model {folder.parent.name}/{folder.name}"
         try:
-            bundle = Bundle.load(folder)
+            detail = f"sha256 {Bundle.load(folder).short_hash}…"
+            checks.append(Check(name, True, True, detail))
         except BundleError as error:
             checks.append(Check(name, False, True, str(error), error.fix))
-        else:
-            checks.append(Check(name, True, True, f"sha256 {bundle.short_hash}…"))
-    return checks
+    nothing = Check("models", False, False, f"none in {root}", "deepshade export, or get models/")
+    return checks or [nothing]
 
 
 def check_port(port: int = 8000) -> list[Check]:

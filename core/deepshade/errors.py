@@ -33,11 +33,9 @@ class LimitError(DeepshadeError):
     """A size exceeds its limit; known before any pixel is decoded."""
 
     def __init__(self, limit: str, value: int, maximum: int) -> None:
-        what = limit.replace("_", " ")
+        what, verb = limit.replace("_", " "), "needs" if limit == "memory_bytes" else "has"
         super().__init__(
-            f"the image needs {value:,} {what}, the limit is {maximum:,}"
-            if limit == "memory_bytes"
-            else f"the image has {value:,} {what}, the limit is {maximum:,}",
+            f"the image {verb} {value:,} {what}, the limit is {maximum:,}",
             fix=f"use a smaller image, or allow more: Limits({limit}=...)",
         )
         self.limit = limit
@@ -57,13 +55,10 @@ class MissingAttributeError(DeepshadeError):
         why: Mapping[str, str] | None = None,
     ) -> None:
         near = {name: tuple(close) for name, close in (near or {}).items() if close}
-        parts = []
-        for name in missing:
-            reason = f" ({why[name]})" if why and why.get(name) else ""
-            parts.append(f"'{name}'{reason}")
-        shown = ", ".join(found[:24]) + (", …" if len(found) > 24 else "")
+        reasons = {name: f" ({why[name]})" for name in missing if why and why.get(name)}
+        lacking = ", ".join(f"'{name}'{reasons.get(name, '')}" for name in missing)
         super().__init__(
-            f"missing {', '.join(parts)}; channels found: {shown or 'none'}",
+            f"missing {lacking}; channels found: {_shortened(found) or 'none'}",
             fix=_mapping_hint(missing, near),
         )
         self.missing = tuple(missing)
@@ -75,10 +70,9 @@ class AmbiguousChannelError(DeepshadeError):
     """Several channels could be the same attribute; deepshade never guesses."""
 
     def __init__(self, attribute: str, candidates: Sequence[str]) -> None:
-        shown = ", ".join(candidates[:24]) + (", …" if len(candidates) > 24 else "")
         super().__init__(
-            f"'{attribute}' could be any of: {shown}",
-            fix=f"choose one: --map {attribute}={candidates[0]}" if candidates else "",
+            f"'{attribute}' could be any of: {_shortened(candidates)}",
+            fix=f"choose one: --map {attribute}={candidates[0]}",
         )
         self.attribute = attribute
         self.candidates = tuple(candidates)
@@ -123,10 +117,12 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
     return by_lower[match[0]] if match else None
 
 
+def _shortened(names: Sequence[str]) -> str:
+    return ", ".join(names[:24]) + (", …" if len(names) > 24 else "")
+
+
 def _mapping_hint(missing: Sequence[str], near: Mapping[str, Sequence[str]]) -> str:
     for name in missing:
         if near.get(name):
             return f"if '{near[name][0]}' is it: --map {name}={near[name][0]}"
-    if missing:
-        return f"render with that pass on, or name its channel: --map {missing[0]}=<layer>"
-    return ""
+    return f"render with that pass on, or name its channel: --map {missing[0]}=<layer>"

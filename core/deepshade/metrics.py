@@ -16,14 +16,7 @@ C2 = 1e-3
 _STRIP = 16  # rows of windows at a time: what is being worked on stays in the CPU's cache
 
 
-def ssim_map(
-    image: ArrayLike,
-    reference: ArrayLike,
-    *,
-    window: int = WINDOW,
-    c1: float = C1,
-    c2: float = C2,
-) -> Plane:
+def ssim_map(image: ArrayLike, reference: ArrayLike, *, window: int = WINDOW) -> Plane:
     """SSIM of every window: (H - window + 1, W - window + 1), or (C, …) for (C, H, W) images.
 
     Uniform windows at stride 1, variances over the window's pixels (divided by their number).
@@ -38,12 +31,12 @@ def ssim_map(
         for top in range(0, height, _STRIP):
             strip = slice(top, min(top + _STRIP, height) + rows - 1)
             maps[channel, top : top + _STRIP] = _ssim_strip(
-                x[channel, strip], y[channel, strip], middle, window, c1, c2
+                x[channel, strip], y[channel, strip], middle, window
             )
     return maps[0] if np.ndim(image) == 2 else maps
 
 
-def _ssim_strip(x: Plane, y: Plane, middle: float, window: int, c1: float, c2: float) -> Plane:
+def _ssim_strip(x: Plane, y: Plane, middle: float, window: int) -> Plane:
     """SSIM of every window of two (H, W) planes, by sums over boxes in float64.
 
     `middle`, the reference's mean, is subtracted first, so that no variance is the small
@@ -58,8 +51,8 @@ def _ssim_strip(x: Plane, y: Plane, middle: float, window: int, c1: float, c2: f
     covariance = product - mean_u * mean_v
     variances = square - mean_u * mean_u - mean_v * mean_v  # of both together
     mean_x, mean_y = mean_u + middle, mean_v + middle
-    top = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
-    bottom = (mean_x * mean_x + mean_y * mean_y + c1) * (variances + c2)
+    top = (2 * mean_x * mean_y + C1) * (2 * covariance + C2)
+    bottom = (mean_x * mean_x + mean_y * mean_y + C1) * (variances + C2)
     return np.asarray(top / bottom)
 
 
@@ -78,20 +71,13 @@ def _box_sums(plane: Plane, size: int, axis: int) -> Plane:
     return sums + part(plane, size - 1) if size % 2 else sums
 
 
-def ssim(
-    image: ArrayLike,
-    reference: ArrayLike,
-    *,
-    window: int = WINDOW,
-    c1: float = C1,
-    c2: float = C2,
-) -> float:
+def ssim(image: ArrayLike, reference: ArrayLike, *, window: int = WINDOW) -> float:
     """Mean structural similarity of two (H, W) or (C, H, W) images: 1 = equal, in [-1, 1].
 
     The paper's: uniform 8 x 8 windows at stride 1, C1 = 1e-4, C2 = 1e-3, for values in [0, 1]
     (clamp them first). Raises ValueError for different shapes or non-finite values.
     """
-    return float(ssim_map(image, reference, window=window, c1=c1, c2=c2).mean())
+    return float(ssim_map(image, reference, window=window).mean())
 
 
 def dssim(image: ArrayLike, reference: ArrayLike) -> float:

@@ -22,12 +22,9 @@ def srgb(image: ArrayLike) -> Picture:
 
     Values are clamped to [0, 1]; NaN becomes 0.
     """
-    planes = np.asarray(image, np.float32)
-    planes = planes[None] if planes.ndim == 2 else planes
-    linear = np.clip(np.nan_to_num(planes), 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    pixels = np.rint(255 * encoded).astype(np.uint8)
-    return np.ascontiguousarray(np.broadcast_to(pixels, (3, *pixels.shape[1:])).transpose(1, 2, 0))
+    linear = np.clip(np.nan_to_num(np.asarray(image, np.float32)), 0.0, 1.0)
+    curved = 1.055 * linear ** (1 / 2.4) - 0.055
+    return shading(np.where(linear <= 0.0031308, 12.92 * linear, curved))
 
 
 def shading(image: ArrayLike) -> Picture:

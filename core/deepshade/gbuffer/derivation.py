@@ -22,12 +22,12 @@ Requirement = Literal["fov", "matrix", "lens"]
 
 _PIECE = 2**13  # pixels transformed at a time
 
-_REQUIREMENTS: dict[str, str] = {
+_REQUIREMENTS: dict[Requirement, str] = {
     "fov": "the field of view",
     "matrix": "the camera's matrix (worldToCamera)",
     "lens": "the header's deepshade:focus and deepshade:aperture",
 }
-REQUIREMENT_FIXES: dict[str, str] = {
+REQUIREMENT_FIXES: dict[Requirement, str] = {
     "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov",
     "matrix": "write the standard header attribute worldToCamera (M44f)",
     "lens": "write deepshade:focus (distance) and deepshade:aperture (diameter), scene units",
@@ -82,31 +82,11 @@ def _position_from_world(s: Source) -> Array:
     return out.reshape(points.shape)
 
 
-def _position_from_depth(s: Source) -> Array:
-    return s.view.position_from_depth(s.arrays["depth"][0])
-
-
 def _position_from_distance(s: Source) -> Array:
     distance = s.arrays["distance"][0]
     rays = s.view.rays(distance.shape[1], distance.shape[0])
     rays *= distance / np.sqrt((rays * rays).sum(0))  # |ray| >= 1, as its z is -1
     return rays
-
-
-def _depth_from_position(s: Source) -> Array:
-    return -s.arrays["position"][2:3]
-
-
-def _normal_from_world(s: Source) -> Array:
-    return _turned(rotation_of(s.world_to_camera), s.arrays["normal_world"])
-
-
-def _world_from_normal(s: Source) -> Array:
-    return _turned(rotation_of(s.world_to_camera).T, s.arrays["normal"])
-
-
-def _normal_from_position(s: Source) -> Array:
-    return normals_from_positions(s.arrays["position"], s.valid)
 
 
 def _view(s: Source) -> Array:
@@ -116,14 +96,6 @@ def _view(s: Source) -> Array:
         rays = s.camera.rays(*s.valid.shape[::-1])
         np.copyto(toward, unit(-rays), where=~s.valid)
     return _turned(rotation_of(s.world_to_camera).T, toward)
-
-
-def _angle_in_camera_space(s: Source) -> Array:
-    return _angle(-s.arrays["position"], s.arrays["normal"])
-
-
-def _angle_in_world_space(s: Source) -> Array:
-    return _angle(s.arrays["view"], s.arrays["normal_world"])
 
 
 def _focal(s: Source) -> Array:
@@ -141,7 +113,11 @@ _TABLE = (
         "from world-space positions and worldToCamera",
     ),
     Derivation(
-        "position", ("depth",), "fov", _position_from_depth, "from depth and the field of view"
+        "position",
+        ("depth",),
+        "fov",
+        lambda s: s.view.position_from_depth(s.arrays["depth"][0]),
+        "from depth and the field of view",
     ),
     Derivation(
         "position",
@@ -150,26 +126,28 @@ _TABLE = (
         _position_from_distance,
         "from the distance along rays and the field of view",
     ),
-    Derivation("depth", ("position",), None, _depth_from_position, "from position: -P.z"),
+    Derivation(
+        "depth", ("position",), None, lambda s: -s.arrays["position"][2:3], "from position: -P.z"
+    ),
     Derivation(
         "normal",
         ("normal_world",),
         "matrix",
-        _normal_from_world,
+        lambda s: _turned(rotation_of(s.world_to_camera), s.arrays["normal_world"]),
         "from world-space normals and worldToCamera",
     ),
     Derivation(
         "normal",
         ("position",),
         None,
-        _normal_from_position,
+        lambda s: normals_from_positions(s.arrays["position"], s.valid),
         "from differences of neighbouring positions",
     ),
     Derivation(
         "normal_world",
         ("normal",),
         "matrix",
-        _world_from_normal,
+        lambda s: _turned(rotation_of(s.world_to_camera).T, s.arrays["normal"]),
         "from camera-space normals and worldToCamera",
     ),
     Derivation("view", ("position",), "matrix", _view, "from position and worldToCamera"),
@@ -177,14 +155,14 @@ _TABLE = (
         "view_angle",
         ("position", "normal"),
         None,
-        _angle_in_camera_space,
+        lambda s: _angle(-s.arrays["position"], s.arrays["normal"]),
         "the angle between -position and normal",
     ),
     Derivation(
         "view_angle",
         ("view", "normal_world"),
         None,
-        _angle_in_world_space,
+        lambda s: _angle(s.arrays["view"], s.arrays["normal_world"]),
         "the angle between view and world-space normal",
     ),
     Derivation("focal", ("depth",), "lens", _focal, "from depth, focus distance and aperture"),
@@ -224,30 +202,25 @@ def plan(
 
 def unmet(target: str, have: Collection[str], met: Collection[str]) -> list[Requirement]:
     """The fewest requirements that would make `target` derivable; [] if none would help."""
-    missing: list[Requirement] = [r for r in ("fov", "matrix", "lens") if r not in met]
+    missing = [r for r in _REQUIREMENTS if r not in met]
     for one in missing:
         if plan(target, have, {*met, one}) is not None:
             return [one]
-    if plan(target, have, {"fov", "matrix", "lens"}) is None:
+    if plan(target, have, _REQUIREMENTS) is None:
         return []
-    return [r for r in missing if plan(target, have, {"fov", "matrix", "lens"} - {r}) is None]
+    return [r for r in missing if plan(target, have, _REQUIREMENTS.keys() - {r}) is None]
 
 
 def requirements(
     camera: Camera | None, matrix: NDArray[np.float64] | None, header: Mapping[str, Any]
 ) -> set[Requirement]:
     """Which requirements the camera and header fulfil."""
-    met: set[Requirement] = set()
-    if camera is not None:
-        met.add("fov")
-        if lens_of(header):
-            met.add("lens")
-    if matrix is not None:
-        met.add("matrix")
-    return met
+    lens = camera is not None and lens_of(header) is not None
+    there = {"fov": camera is not None, "matrix": matrix is not None, "lens": lens}
+    return {name for name in _REQUIREMENTS if there[name]}
 
 
-def requirement_text(names: Collection[str]) -> str:
+def requirement_text(names: Collection[Requirement]) -> str:
     """The requirements in words, for an error."""
     return " and ".join(_REQUIREMENTS[name] for name in names)
 

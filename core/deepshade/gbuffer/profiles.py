@@ -2,8 +2,8 @@
 
 Each profile is one row of a table. Blender, Arnold, RenderMan, V-Ray and Unreal use fixed names;
 Mitsuba's are chosen by whoever wrote the scene, so its rows count only in files that say they
-come from Mitsuba, or when the profile is asked for. Depths of "planar" kind are measured along
-the view axis (attribute `depth`), those of "ray" kind along the ray (quantity `distance`).
+come from Mitsuba, or when the profile is asked for. Depths along the view axis are the attribute
+`depth`, those along the ray the quantity `distance`.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One renderer's conventions. `motion` says what a stored motion vector means."""
+    """One renderer's conventions: its names for quantities, and the files that `made_by` knows.
+
+    `world` is the handedness of world space. `free_names` are only a scene's author's, and count
+    in files of that renderer alone. `fov` are header attributes with the horizontal field of view
+    in degrees, and `matrix` makes worldToCamera of others.
+    """
 
     name: str
-    title: str
     sources: tuple[Source, ...]
     made_by: Callable[[Header], bool]
     world: Literal["right", "left"] = "right"
-    camera: Literal["right", "left"] = "right"
-    depth: Literal["planar", "ray"] = "planar"
-    motion: str = "pixels"
-    unit: str = "scene units"
     free_names: bool = False
     fov: tuple[str, ...] = ()
     matrix: Callable[[Header], NDArray[np.float64] | None] | None = None
@@ -93,10 +93,6 @@ def match_rank(layer: str, alias: str, *, from_stem: bool = False) -> int | None
 
 def _signed(*prefixes: str) -> Callable[[Header], bool]:
     return lambda header: any(key.startswith(prefixes) for key in header)
-
-
-def _generated_by_mitsuba(header: Header) -> bool:
-    return "mitsuba" in str(header.get("generatedBy", "")).lower()
 
 
 def _blender(header: Header) -> bool:
@@ -140,7 +136,6 @@ _CANONICAL = tuple(
 _TABLE: Sequence[Profile] = (
     Profile(
         "deepshade",
-        "deepshade's own names",
         (*_CANONICAL, Source("position_world", ("position_world",)), Source("alpha", ("A",))),
         # its names are their own signature: header facts like deepshade:fov may be added to
         # any renderer's file
@@ -148,7 +143,6 @@ _TABLE: Sequence[Profile] = (
     ),
     Profile(
         "blender",
-        "Blender (Cycles, Eevee)",
         (
             Source("position_world", ("Position",)),
             Source("normal_world", ("Normal",)),
@@ -158,24 +152,20 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("Vector",), _UP_TO_DOWN, components="zw"),
         ),
         _blender,
-        motion="pixels to the next frame, v up",
     ),
     Profile(
         "mitsuba",
-        "Mitsuba 3 (aov integrator)",
         (
             Source("position_world", ("position", "pos", "p")),
             Source("normal_world", ("sh_normal", "normal", "nn", "n")),
             Source("distance", ("depth", "dd.y", "dd")),
             Source("diffuse", ("albedo",)),
         ),
-        _generated_by_mitsuba,
-        depth="ray",
+        lambda header: "mitsuba" in str(header.get("generatedBy", "")).lower(),
         free_names=True,
     ),
     Profile(
         "arnold",
-        "Arnold",
         (
             Source("position_world", ("P",)),
             Source("normal_world", ("N",)),
@@ -184,12 +174,10 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("motionvector",), _UP_TO_DOWN),
         ),
         _signed("arnold/"),
-        motion="pixels, v up",
         fov=("CameraFov",),
     ),
     Profile(
         "renderman",
-        "RenderMan",
         (
             Source("position_world", ("Pworld", "__Pworld")),
             Source("normal_world", ("Nworld", "__Nworld")),
@@ -198,12 +186,9 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("motionFore",), _UP_TO_DOWN),
         ),
         _signed("rman", "prman", "PixarRenderMan", "renderman"),
-        camera="left",
-        motion="pixels, v up",
     ),
     Profile(
         "vray",
-        "V-Ray",
         (
             Source("normal", ("normals",)),
             Source("depth", ("zDepth", "Z")),
@@ -211,12 +196,10 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("velocity",), _UP_TO_DOWN),
         ),
         _signed("vray", "VRay"),
-        motion="pixels, v up",
     ),
     Profile(
         "unreal",
-        "Unreal Engine (Movie Render Queue)",
-        (
+        (  # lengths in centimetres
             Source("normal_world", ("WorldNormal", "FinalImageWorldNormal")),
             Source("position_world", ("WorldPosition", "FinalImageWorldPosition")),
             Source(
@@ -227,7 +210,6 @@ _TABLE: Sequence[Profile] = (
         ),
         _signed("unreal/"),
         world="left",
-        unit="centimetres",
         fov=("unreal/camera/FinalImage/fov", "unreal/camera/fov"),
         matrix=_unreal_matrix,
     ),
