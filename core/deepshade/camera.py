@@ -20,7 +20,6 @@ _PLACING: dict[str, tuple[tuple[int, ...], float | None]] = {
     "screenWindowWidth": ((), 0.0),
     "worldToCamera": ((4, 4), None),
 }
-_FALLBACK_UP = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -58,13 +57,7 @@ class Camera:
 
     @classmethod
     def look_at(
-        cls,
-        eye: ArrayLike,
-        target: ArrayLike,
-        up: ArrayLike,
-        fov: float,
-        width: int,
-        height: int,
+        cls, eye: ArrayLike, target: ArrayLike, up: ArrayLike, fov: float, width: int, height: int
     ) -> Camera:
         """A camera at `eye` looking to `target`, both (3,) in world space; `up` points up.
 
@@ -81,7 +74,7 @@ class Camera:
             )
         backward /= distance
         right = np.zeros(3)
-        for candidate in (up_, *map(np.array, _FALLBACK_UP)):
+        for candidate in (up_, np.array([0.0, 0, 1]), np.array([0.0, 1, 0])):
             right = np.cross(candidate, backward)
             length = float(np.linalg.norm(right))
             if length > 1e-9 * float(np.linalg.norm(candidate)):
@@ -117,8 +110,7 @@ class Camera:
 
         `width` and `height` are those of the data window; the whole frame by default.
         """
-        width = self.width if width is None else width
-        height = self.height if height is None else height
+        width, height = width or self.width, height or self.height
         scale = 1.0 / self.pixels_per_unit
         x = (np.arange(width) + (self.x0 + 0.5 - 0.5 * self.width)) * scale + self.center[0]
         y = 0.5 * self.height - self.y0 - 0.5 - np.arange(height)

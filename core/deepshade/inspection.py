@@ -64,18 +64,15 @@ def inspect_files(
     paths = [Path(file) for file in files]
     bodies = [exr.fetch(path, limits) for path in paths]
     headers = [exr.read_header(body, limits) for body in bodies]
-    plan = plan_gbuffer(
-        headers,
-        [path.stem for path in paths],
-        list(ATTRIBUTES),
-        profile=profile,
-        mapping=mapping,
-        fov=fov,
-    )
+    stems, wanted = [path.stem for path in paths], list(ATTRIBUTES)
+    plan = plan_gbuffer(headers, stems, wanted, profile=profile, mapping=mapping, fov=fov)
     return {
         "files": [_file(path, header) for path, header in zip(paths, headers, strict=True)],
         "profile": plan.profile.name if plan.profile else None,
-        "camera": _camera(plan),
+        "camera": {
+            "fov": plan.camera.fov if plan.camera else None,
+            "world_to_camera": plan.matrix.tolist() if plan.matrix is not None else None,
+        },
         "mapped": {name: str(choice) for name, choice in plan.choices.items()},
         "ambiguous": {name: list(e.candidates) for name, e in plan.ambiguous.items()},
         "effects": {name: _effect(plan, effect.inputs) for name, effect in EFFECTS.items()},
@@ -100,13 +97,6 @@ def _file(path: Path, header: Any) -> dict[str, Any]:
             }
             for part in header.parts
         ],
-    }
-
-
-def _camera(plan: Plan) -> dict[str, Any]:
-    return {
-        "fov": plan.camera.fov if plan.camera else None,
-        "world_to_camera": plan.matrix.tolist() if plan.matrix is not None else None,
     }
 
 
@@ -153,8 +143,8 @@ def _statistics(plan: Plan, bodies: Sequence[bytes], limits: Limits) -> dict[str
             row: dict[str, Any] = {
                 "pixels": int(finite.size),
                 "nonfinite": int(finite.size - np.count_nonzero(finite)),
-                "min": [float(v) for v in inside.min(1)] if inside.size else None,
-                "max": [float(v) for v in inside.max(1)] if inside.size else None,
+                "min": inside.min(1).tolist() if inside.size else None,
+                "max": inside.max(1).tolist() if inside.size else None,
             }
             if name in ("normal", "normal_world") and inside.size:
                 lengths = np.sqrt((inside.astype(np.float64) ** 2).sum(0))
@@ -177,12 +167,11 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
         table = Table("part", "size", "window", "frame", "compression", "channels")
         for index, part in enumerate(file["parts"]):
             x0, y0, x1, y1 = part["data_window"]
-            fx0, fy0, fx1, fy1 = part["display_window"]
             table.add_row(
                 _safe(part["name"] or str(index)),
                 f"{x1 - x0 + 1} x {y1 - y0 + 1}",
-                f"({x0}, {y0}) to ({x1}, {y1})",
-                f"({fx0}, {fy0}) to ({fx1}, {fy1})",
+                "({}, {}) to ({}, {})".format(*part["data_window"]),
+                "({}, {}) to ({}, {})".format(*part["display_window"]),
                 part["compression"] + (" tiled" if part["tiled"] else ""),
                 _safe(", ".join(f"{name} {kind}" for name, kind in part["channels"].items())),
             )

@@ -43,23 +43,17 @@ class Cursor:
         self.data = data
         self.at = at
 
-    def skip(self, count: int) -> int:
-        """The position before it moves on by `count` bytes."""
+    def skip(self, count: int, where: str = "header") -> int:
+        """The position before it moves on by `count` bytes, which lie in `where`."""
         start = self.at
         if count < 0 or count > len(self.data) - start:
-            raise truncated("within the header")
+            raise truncated(f"within the {where}")
         self.at = start + count
         return start
 
     def unpack(self, layout: str) -> tuple[Any, ...]:
         """The next values, in a layout of `struct`."""
         return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout)))
-
-    def peek(self) -> int:
-        """The next byte, without moving on."""
-        if self.at >= len(self.data):
-            raise truncated("within the header")
-        return self.data[self.at]
 
     def name(self) -> str:
         """The next zero-terminated text of up to 255 bytes."""
@@ -71,12 +65,6 @@ class Cursor:
             raise DamagedImageError("the header holds a name longer than 255 bytes")
         self.at += end + 1
         return window[:end].decode("utf-8", "replace")
-
-    def table(self, count: int) -> int:
-        """The position of the chunk table of `count` entries that is next; moves behind it."""
-        if count > (len(self.data) - self.at) // 8:
-            raise truncated("within the chunk table")
-        return self.skip(8 * count)
 
 
 def read_part(cursor: Cursor, limits: Limits, limit: int) -> RawPart:

@@ -70,8 +70,13 @@ def encode(
     line_bytes = width * sum(2 if is_half else 4 for is_half, _ in planes)
     if lines * line_bytes > MAX_CHUNK:
         raise ValueError(f"{lines} scanlines of {line_bytes:,} bytes are too much for a chunk")
+    layout = struct.Struct("<iB3xii")  # pixel type, linear, and every pixel is sampled
+    pixel_types = b"".join(
+        _name(name) + layout.pack(_HALF if name in half else _FLOAT, 0, 1, 1)
+        for name in sorted(channels)
+    )
     structure = {
-        "channels": ("chlist", _channel_list({name: name in half for name in sorted(channels)})),
+        "channels": ("chlist", pixel_types + bytes(1)),
         "compression": ("compression", bytes([code])),
         "dataWindow": ("box2i", struct.pack("<4i", *data_window)),
         "displayWindow": ("box2i", struct.pack("<4i", *display_window)),
@@ -138,13 +143,12 @@ def _header(
     channels: Iterable[str],
 ) -> bytes:
     """All that comes before the chunk table; `structure` holds (type, value)."""
-    values = {name: _value(value) for name, value in {**_REQUIRED, **attributes}.items()}
+    attributes = {**_REQUIRED, **attributes}
+    values = {name: _value(value) for name, value in attributes.items()}
     for name, default in _REQUIRED.items():
         if values[name][0] != (kind := _value(default)[0]):
             raise ValueError(f"the header attribute '{name}' must be {kind}, not {values[name][0]}")
-    aspect, width = (
-        {**_REQUIRED, **attributes}[name] for name in ("pixelAspectRatio", "screenWindowWidth")
-    )
+    aspect, width = attributes["pixelAspectRatio"], attributes["screenWindowWidth"]
     if not (0 < aspect < float("inf") and 0 <= width < float("inf")):
         raise ValueError(f"no EXR has a pixel aspect of {aspect} or a screen window {width} wide")
     for name in ("channels", "lineOrder", "chunkCount"):
@@ -156,15 +160,6 @@ def _header(
     long = any(len(name.encode()) > _SHORT_NAME for name in (*values, *channels))
     start = struct.pack("<2I", MAGIC, 2 | (LONG_NAMES if long else 0))
     return b"".join((start, *pieces, b"\0"))
-
-
-def _channel_list(channels: Mapping[str, bool]) -> bytes:
-    """The value of the attribute `channels`; they map names to whether they are half floats."""
-    layout = struct.Struct("<iB3xii")  # pixel type, linear, and every pixel is sampled
-    return b"".join(
-        _name(name) + layout.pack(_HALF if is_half else _FLOAT, 0, 1, 1)
-        for name, is_half in channels.items()
-    ) + bytes(1)
 
 
 def _name(name: str) -> bytes:

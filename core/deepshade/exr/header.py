@@ -127,14 +127,12 @@ def parse(data: Buffer, limits: Limits) -> Header:
     multipart = bool(flags & MULTIPART)
     raws = [read_part(cursor, limits, MAX_ATTRIBUTES)]
     left = MAX_ATTRIBUTES - len(raws[0].types)
-    while multipart and cursor.peek() != 0:
+    while multipart and cursor.unpack("B")[0]:  # a zero ends the parts
+        cursor.at -= 1
         limits.check("parts", len(raws) + 1)
         raws.append(read_part(cursor, limits, left))
         left -= len(raws[-1].types)
         limits.check("channels", sum(len(raw.channels) for raw in raws))
-    if multipart:
-        cursor.skip(1)
-    limits.check("channels", sum(len(raw.channels) for raw in raws))
 
     # the tables of all parts come first, then all the chunks
     parts = [_check_part(raw, cursor, flags, index, limits) for index, raw in enumerate(raws)]
@@ -215,7 +213,7 @@ def _check_part(raw: RawPart, cursor: Cursor, flags: int, index: int, limits: Li
         decoded_bytes=decoded,
         chunks=Chunks(
             window=data_window,
-            table_at=cursor.table(count),
+            table_at=cursor.skip(8 * count, "chunk table"),
             count=count,
             height=lines,
             number=index if multipart else None,

@@ -95,7 +95,13 @@ def read(
                 f"channel '{name}' is subsampled (luminance/chroma)",
                 fix="save every channel at full resolution, for example as R G B",
             )
-    pixels = _allocate([(name, header.parts[places[name][0]].shape) for name in wanted])
+    # planes of one shape lie one after the other in memory, so that `stack` need not copy them
+    shapes = {name: header.parts[places[name][0]].shape for name in wanted}
+    blocks = {
+        shape: iter(np.empty((count, *shape), np.float32))
+        for shape, count in Counter(shapes.values()).items()
+    }
+    pixels = {name: next(blocks[shape]) for name, shape in shapes.items()}
     jobs: dict[int, Wanted] = {}
     for name in wanted:
         index, channel = places[name]
@@ -147,7 +153,11 @@ def write(
             for piece in exrencode.encode(planes, halves, data, display, compression, header):
                 stream.write(piece)
             return
-        stored = {name: _encodable(plane, name in halves) for name, plane in planes.items()}
+        # contiguous: strided arrays the library writes wrongly without an error (issue 1929)
+        stored = {
+            name: floats.to_half(plane) if name in halves else np.ascontiguousarray(plane, "f4")
+            for name, plane in planes.items()
+        }
         settings = header | {
             "compression": COMPRESSIONS[compression],
             "type": OpenEXR.scanlineimage,
@@ -180,13 +190,6 @@ def fetch(source: Path | str | bytes, limits: Limits) -> bytes:
         raise ImageError(f"can't read {path}: {error.strerror}") from error
 
 
-def _allocate(shapes: Sequence[tuple[str, tuple[int, int]]]) -> dict[str, Pixels]:
-    """Named planes; those of one shape lie one after the other in memory, in this order."""
-    counts = Counter(shape for _, shape in shapes)
-    blocks = {shape: iter(np.empty((n, *shape), np.float32)) for shape, n in counts.items()}
-    return {name: next(blocks[shape]) for name, shape in shapes}
-
-
 def _plane(name: str, plane: ArrayLike) -> NDArray[Any]:
     array = np.asarray(plane)
     if array.ndim != 2 or array.size == 0:
@@ -196,15 +199,8 @@ def _plane(name: str, plane: ArrayLike) -> NDArray[Any]:
     return array
 
 
-def _encodable(plane: NDArray[Any], half: bool) -> NDArray[Any]:
-    """What the library is given; strided arrays it writes wrongly without an error (issue 1929)."""
-    return floats.to_half(plane) if half else np.ascontiguousarray(plane, np.float32)
-
-
 def _attribute(key: str, value: Any) -> Any:
-    if isinstance(value, (bool, np.bool_)):
-        return int(value)
-    if isinstance(value, (int, np.integer)):
+    if isinstance(value, (int, np.integer, np.bool_)):
         return int(value) if -(2**31) <= value < 2**31 else str(value)
     if isinstance(value, (float, np.floating)):
         return float(value)

@@ -9,14 +9,9 @@ from dataclasses import dataclass, field
 from deepshade.errors import AmbiguousChannelError, ConfigError, MissingAttributeError
 from deepshade.exr import Header
 from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, Profile, Source, match_rank
-from deepshade.gbuffer.suggestions import near_misses
 
-_COMPONENTS = {letter: letter for letter in "xyzwrgbauvt"} | {
-    "red": "r",
-    "green": "g",
-    "blue": "b",
-    "alpha": "a",
-}
+_WORDS = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
+_COMPONENTS = {letter: letter for letter in "xyzwrgbauvt"} | _WORDS
 # which components may stand for one, two or three values, best first
 _SETS = {3: ("xyz", "rgb"), 2: ("uv", "xy", "rg"), 1: ("v", "z", "t", "y", "r", "x", "a")}
 
@@ -143,14 +138,6 @@ def choose(
     return found, ambiguous
 
 
-def missing(
-    layers: Sequence[Layer], attributes: Sequence[str], why: Mapping[str, str]
-) -> MissingAttributeError:
-    """The error that names what is missing, what was found, and what comes near."""
-    found = [name for layer in layers for name in layer.channels]
-    return MissingAttributeError(attributes, found, near_misses(layers, attributes), why=why)
-
-
 def _split(channel: str, bare: set[str]) -> tuple[str, str]:
     """(layer, component) of a channel; `bare` are the part's dotless names, lower case."""
     layer, dot, last = channel.rpartition(".")
@@ -218,17 +205,16 @@ def _search(
                     quantity,
                     [f"{', '.join(channels)} as {q.name} writes {s.quantity}" for q, s in options],
                 )
-            found.append(
-                (rank, layer, Choice(quantity, layer.file, channels, source.signs, p.name))
-            )
+            choice = Choice(quantity, layer.file, channels, source.signs, p.name)
+            found.append((rank, layer, choice))
             break
     if not found:
         return None
     best = min(rank for rank, _, _ in found)
-    rivals_ = [(layer, choice) for rank, layer, choice in found if rank == best]
-    if len(rivals_) > 1:
-        raise AmbiguousChannelError(quantity, [layer.name for layer, _ in rivals_])
-    return rivals_[0][1]
+    equals = [(layer, choice) for rank, layer, choice in found if rank == best]
+    if len(equals) > 1:
+        raise AmbiguousChannelError(quantity, [layer.name for layer, _ in equals])
+    return equals[0][1]
 
 
 def _fits(layer: Layer, source: Source) -> bool:

@@ -90,7 +90,9 @@ def load_gbuffer(
             raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called '{name}'")
     stems, bodies = _fetch(sources, limits)
     headers = headers or [exr.read_header(body, limits) for body in bodies]
-    _check_together(headers, limits)
+    limits.check("parts", sum(len(header.parts) for header in headers))
+    limits.check("channels", sum(len(p.channels) for header in headers for p in header.parts))
+    limits.check("decoded_bytes", sum(header.decoded_bytes for header in headers))
     planned = plan_gbuffer(headers, stems, needs, profile=profile, mapping=mapping, fov=fov)
     planned.require(needs)
     steps: dict[str, derivation.Derivation] = {}
@@ -130,35 +132,20 @@ def source_name(field: str, filename: str) -> str:
 
 
 def _fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str], list[bytes]]:
-    if isinstance(sources, (str, bytes, Path)) or (
-        isinstance(sources, tuple)
-        and len(sources) == 2
-        and isinstance(sources[0], str)
-        and isinstance(sources[1], bytes)
+    if isinstance(sources, str | bytes | Path) or (
+        isinstance(sources, tuple) and [type(item) for item in sources] == [str, bytes]
     ):
         sources = [cast(Source, sources)]
     stems, bodies, total = [], [], 0
     for source in sources:
-        if isinstance(source, bytes):
-            stems.append("")
-            bodies.append(source)
-        elif isinstance(source, tuple):
-            stems.append(Path(source[0]).stem)
-            bodies.append(source[1])
-        else:
-            stems.append(Path(source).stem)
-            bodies.append(exr.fetch(source, limits))
+        name = source[0] if isinstance(source, tuple) else source
+        stems.append("" if isinstance(name, bytes) else Path(name).stem)
+        bodies.append(source[1] if isinstance(source, tuple) else exr.fetch(source, limits))
         total += len(bodies[-1])
         limits.check("body_bytes", total)
     if not bodies:
         raise ImageError("no image was given", fix="name at least one EXR file")
     return stems, bodies
-
-
-def _check_together(headers: Sequence[Header], limits: Limits) -> None:
-    limits.check("parts", sum(len(header.parts) for header in headers))
-    limits.check("channels", sum(len(p.channels) for header in headers for p in header.parts))
-    limits.check("decoded_bytes", sum(header.decoded_bytes for header in headers))
 
 
 def _derive(

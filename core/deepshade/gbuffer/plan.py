@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from deepshade import exr
 from deepshade.camera import Camera, matrix_from_header
-from deepshade.errors import AmbiguousChannelError, CameraError, ImageError
+from deepshade.errors import AmbiguousChannelError, CameraError, ImageError, MissingAttributeError
 from deepshade.exr import Header
 from deepshade.gbuffer import channels, derivation
 from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, Profile, detect
 from deepshade.gbuffer.profiles import profile as profile_named
+from deepshade.gbuffer.suggestions import near_misses
 
 MARKERS = ("depth", "distance", "alpha")  # read, where there, to know the background
 
@@ -63,9 +64,7 @@ class Plan:
         if attribute in self.ambiguous:
             return str(self.ambiguous[attribute])
         needs = derivation.unmet(attribute, self.choices, self.met)
-        if needs:
-            return f"needs {derivation.requirement_text(needs)}"
-        return "not there"
+        return f"needs {derivation.requirement_text(needs)}" if needs else "not there"
 
     def how(self, step: derivation.Derivation) -> str:
         """How a derivation gets its attribute, and what it had to pass over."""
@@ -92,7 +91,9 @@ class Plan:
         unmet = {name: derivation.unmet(name, self.choices, self.met) for name in lacking}
         missing = [name for name in lacking if not unmet[name]]
         if missing:
-            raise channels.missing(self.layers, missing, {})
+            found = [name for layer in self.layers for name in layer.channels]
+            near = near_misses(self.layers, missing)
+            raise MissingAttributeError(missing, found, near)
         wanted = list(dict.fromkeys(need for name in lacking for need in unmet[name]))
         raise CameraError(
             f"{', '.join(map(repr, lacking))} could be derived from what is there, but that needs "
@@ -124,16 +125,14 @@ def plan_gbuffer(
     layers = channels.layers(headers, stems)
     wanted = list(dict.fromkeys((*needs, *_related(needs), *MARKERS)))
     choices, ambiguous = channels.choose(layers, wanted, known, mapping or {})
-    part = headers[0].parts[0]
     for choice in choices.values():
         if known is None and choice.profile not in ("", "deepshade"):
             known = PROFILES[choice.profile]  # for its handedness: the names gave it away
-    if choices:
-        first = next(iter(choices.values()))
-        part = headers[first.file].parts[headers[first.file].channels()[first.channels[0]][0]]
     matrix = _matrix(attributes, known)
-    camera = _camera(part, attributes, known, fov, matrix)
-    return Plan(list(headers), layers, choices, ambiguous, known, camera, matrix, attributes)
+    plan = Plan(list(headers), layers, choices, ambiguous, known, None, matrix, attributes)
+    part = plan.parts(next(iter(choices.values())))[0] if choices else headers[0].parts[0]
+    plan.camera = _camera(part, attributes, known, fov, matrix)
+    return plan
 
 
 def _related(needs: Sequence[str]) -> list[str]:
@@ -141,12 +140,10 @@ def _related(needs: Sequence[str]) -> list[str]:
     related: list[str] = []
     queue = list(needs)
     while queue:
-        target = queue.pop()
-        for step in derivation.steps_to(target):
-            for need in step.needs:
-                if need not in related and need not in needs:
-                    related.append(need)
-                    queue.append(need)
+        for step in derivation.steps_to(queue.pop()):
+            fresh = [need for need in step.needs if need not in {*related, *needs}]
+            related += fresh
+            queue += fresh
     return related
 
 
@@ -176,10 +173,7 @@ def _camera(
                 break
             except (KeyError, TypeError, ValueError):
                 continue
-    facts = dict(attributes)
-    facts.pop("worldToCamera", None)
-    if matrix is not None:
-        facts["worldToCamera"] = matrix.T
+    facts = {**attributes, "worldToCamera": None if matrix is None else matrix.T}
     return Camera.from_header(facts, part.data_window, part.display_window, fov=fov)
 
 
@@ -212,12 +206,10 @@ def chosen(
             f"the attributes cover different pixels: {sizes}", fix="render them as one view"
         )
     window = next(iter(windows))
-    markers = {
-        name: plan.choices[name]
-        for name in MARKERS
-        if name in plan.choices and plan.complete(plan.choices[name], window)
-    }
-    return {**picked, **{name: markers[name] for name in markers if name not in picked}}
+    for name in MARKERS:
+        if name in plan.choices and plan.complete(plan.choices[name], window):
+            picked.setdefault(name, plan.choices[name])
+    return picked
 
 
 def framed(camera: Camera, part: exr.Part) -> Camera:
