@@ -3,15 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import (
-    AbstractContextManager,
-    aclosing,
-    asynccontextmanager,
-    closing,
-    contextmanager,
-)
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -118,7 +112,7 @@ class Client:
 
     def _save(self, path: Path, request: dict[str, Any]) -> Saved:
         response = self._http.send(self._http.build_request(**request), stream=True)
-        with _released(response), closing(response):
+        with _released(response), contextlib.closing(response):
             if not response.is_success:
                 response.read()
             saved = read_saved(response, path)
@@ -214,7 +208,7 @@ class AsyncClient:
     async def _save(self, path: Path, request: dict[str, Any]) -> Saved:
         response = await self._http.send(self._http.build_request(**request), stream=True)
         with _released(response):
-            async with aclosing(response):
+            async with contextlib.aclosing(response):
                 if not response.is_success:
                     await response.aread()
                 saved = read_saved(response, path)
@@ -241,7 +235,7 @@ class AsyncClient:
             await asyncio.sleep(pause)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _released(response: httpx.Response) -> Iterator[httpx.Response]:
     """A context that ends with breaking httpx's cycle of a response and its stream.
 
@@ -253,8 +247,8 @@ def _released(response: httpx.Response) -> Iterator[httpx.Response]:
         response.stream = httpx.ByteStream(b"")
 
 
-@asynccontextmanager
-async def _in_threads(manager: AbstractContextManager[T]) -> AsyncIterator[T]:
+@contextlib.asynccontextmanager
+async def _in_threads(manager: contextlib.AbstractContextManager[T]) -> AsyncIterator[T]:
     """A context whose beginning and good end wait for the disk; a bad end only cleans up."""
     value = await asyncio.to_thread(manager.__enter__)
     try:

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 
 from deepshade_client.batch import Result, Task
@@ -19,12 +19,7 @@ from deepshade_client.exceptions import ServerProblem
 def progress(total: int, *, quiet: bool) -> Iterator[Callable[[Result], None]]:
     """A progress bar on stderr and a line for each picture; only errors if `quiet`."""
     console = Console(stderr=True)
-    columns = (
-        TextColumn("shading"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
+    columns = ("shading", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     show = not quiet and total > 1 and console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=not show) as bar:
         task = bar.add_task("", total=total)
@@ -42,11 +37,9 @@ def progress(total: int, *, quiet: bool) -> Iterator[Callable[[Result], None]]:
 def as_json(tasks: Sequence[Task], results: Sequence[Result]) -> dict[str, Any]:
     """All results as one document, in the order of the tasks."""
     by_task = {result.task: result for result in results}
-    return {
-        "pictures": [_entry(task, by_task.get(task)) for task in tasks],
-        "saved": sum(result.error is None for result in results),
-        "failed": len(tasks) - sum(result.error is None for result in results),
-    }
+    pictures = [_entry(task, by_task.get(task)) for task in tasks]
+    saved = sum(picture["ok"] for picture in pictures)
+    return {"pictures": pictures, "saved": saved, "failed": len(tasks) - saved}
 
 
 def print_effects(effects: Sequence[dict[str, Any]]) -> None:

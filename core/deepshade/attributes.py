@@ -31,7 +31,7 @@ POINT = Unit("length", "float32", scaled=True, turns="camera")  # a place: lengt
 CAMERA_DIRECTION = Unit("direction, camera", turns="camera")
 WORLD_DIRECTION = Unit("direction, world")
 PIXELS = Unit("pixels", "float32")
-SCREEN_MOTION = Unit("pixels", "float32", turns="screen")
+SCREEN_MOTION = Unit("pixels", "float32", turns="screen")  # u right, v down
 RADIANS = Unit("radians")
 REFLECTANCE = Unit("reflectance")
 EXPONENT = Unit("exponent")
@@ -75,26 +75,14 @@ _TABLE = (
     Attribute("depth", "D_s", ("Z",), LENGTH, "planar depth, -P_s.z, > 0"),
     Attribute("focal", "D_focal", ("focal.V",), PIXELS, "signed diameter of the blur circle", True),
     Attribute("view", "C_w", _xyz("view"), WORLD_DIRECTION, "unit direction to the camera", True),
-    Attribute(
-        "view_angle",
-        "C_α",  # noqa: RUF001 - the paper's symbol
-        ("view_angle.V",),
-        RADIANS,
-        "angle between C_w and N_w",
-    ),
+    Attribute("view_angle", "C_α", ("view_angle.V",), RADIANS, "angle of C_w and N_w"),  # noqa: RUF001
     Attribute("diffuse", "R_diff", _rgb("diffuse"), REFLECTANCE, "Phong diffuse reflectance"),
     Attribute("specular", "R_spec", _rgb("specular"), REFLECTANCE, "Phong specular reflectance"),
     Attribute("gloss", "R_gloss", ("gloss.V",), EXPONENT, "Phong exponent"),
     Attribute("scatter", "R_scatt", _rgb("scatter"), LENGTH, "scattering mean free path"),
     Attribute("light", "L", _rgb("light"), RADIANCE, "direct light to the eye; the sky's", True),
     Attribute("light_diffuse", "L_diff", _rgb("light_diffuse"), RADIANCE, "diffuse part of L"),
-    Attribute(
-        "motion",
-        "F",
-        ("motion.U", "motion.V"),
-        SCREEN_MOTION,
-        "motion while the shutter is open, u right, v down",
-    ),
+    Attribute("motion", "F", ("motion.U", "motion.V"), SCREEN_MOTION, "motion in the open shutter"),
 )
 
 ATTRIBUTES: dict[str, Attribute] = {attribute.name: attribute for attribute in _TABLE}

@@ -11,7 +11,7 @@ from typing import Any
 import typer
 import typer.core
 
-from deepshade.errors import DeepshadeError
+from deepshade.errors import DeepshadeError, nearest
 from deepshade.extras import extra_of
 
 GROUP = "deepshade.commands"
@@ -33,8 +33,6 @@ class Commands(typer.core.TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """As usual, but a mistyped name gets the nearest one as a hint."""
-        from deepshade.errors import nearest
-
         if args and self.get_command(ctx, args[0]) is None and not args[0].startswith("-"):
             near = nearest(args[0], self.list_commands(ctx))
             hint = f" Did you mean '{near}'?" if near else ""
@@ -90,7 +88,14 @@ def run(command: Any, argv: Sequence[str] | None = None, *, name: str) -> int:
         _complain(f"{where}{error.strerror or error}", "")
         return 2
     except Exception as error:
-        return _usage_error(error)
+        if type(error).__name__ == "Abort":
+            print("aborted", file=sys.stderr)
+            return 1
+        show, code = getattr(error, "show", None), getattr(error, "exit_code", None)
+        if show is None or code is None:
+            raise  # not of click's: a bug, which keeps its traceback
+        show()
+        return int(code)
 
 
 def _root(
@@ -128,18 +133,6 @@ def _complain(message: str, fix: str) -> None:
     print(f"error: {message}", file=sys.stderr)
     if fix:
         print(f"  fix: {fix}", file=sys.stderr)
-
-
-def _usage_error(error: Exception) -> int:
-    """click's own errors; anything else is a bug and keeps its traceback."""
-    if type(error).__name__ == "Abort":
-        print("aborted", file=sys.stderr)
-        return 1
-    show = getattr(error, "show", None)
-    if show is None or not hasattr(error, "exit_code"):
-        raise error
-    show()
-    return int(error.exit_code)
 
 
 _CONTEXT = {"help_option_names": ["-h", "--help"]}

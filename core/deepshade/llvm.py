@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 OLDEST = 17  # 14 and 15 are refused by Dr.Jit, 16 crashes in it
@@ -39,8 +39,14 @@ def find_libllvm(
         known = _PREFERRED.index(version) if version in _PREFERRED else len(_PREFERRED)
         return known, version, str(path)
 
-    usable = [p for p in _candidates(folders) if (libllvm_version(p) or 0) >= OLDEST]
-    return min(usable, key=order, default=None)
+    found = [
+        library
+        for pattern in folders
+        for folder in Path("/").glob(pattern.lstrip("/"))
+        for library in (*folder.glob("libLLVM*.so*"), *folder.glob("libLLVM*.dylib"))
+        if library.is_file() and (libllvm_version(library) or 0) >= OLDEST
+    ]
+    return min(found, key=order, default=None)
 
 
 def libllvm_version(path: Path) -> int | None:
@@ -51,13 +57,3 @@ def libllvm_version(path: Path) -> int | None:
             return int(next(group for group in match.groups() if group))
     match = re.search(r"llvm(?:-|@)(\d+)", str(path))
     return int(match.group(1)) if match else None
-
-
-def _candidates(folders: tuple[str, ...]) -> Iterator[Path]:
-    for pattern in folders:
-        root, _, rest = pattern.partition("*")
-        matches = Path("/").glob(pattern.lstrip("/")) if rest or "*" in pattern else [Path(root)]
-        for folder in matches:
-            for library in (*folder.glob("libLLVM*.so*"), *folder.glob("libLLVM*.dylib")):
-                if library.is_file():
-                    yield library

@@ -9,7 +9,6 @@ import sys
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -67,20 +66,9 @@ def resident() -> int:
 
 def trim() -> None:
     """Return freed memory to the system. glibc otherwise keeps what lies below its heap's top."""
-    give_back = _malloc_trim()
-    if give_back is not None:
-        give_back(0)
-
-
-@cache
-def _malloc_trim() -> Any:
-    """None where there is none."""
-    if not sys.platform.startswith("linux"):
-        return None
-    try:
-        return ctypes.CDLL(None).malloc_trim
-    except (OSError, AttributeError):  # musl has no malloc_trim
-        return None
+    if sys.platform.startswith("linux"):
+        with suppress(OSError, AttributeError):  # musl has no malloc_trim
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 def describe() -> str:

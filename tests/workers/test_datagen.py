@@ -23,7 +23,7 @@ from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import Manifest
 from deepshade_workers.datagen import DataSpec, expand_scenes, generate, make_sample, make_shard
-from deepshade_workers.sample import render_sample
+from deepshade_workers.render import render_sample
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.procedural import FAMILIES
 from deepshade_workers.shards import schema, write_shard

@@ -15,8 +15,7 @@ from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, SceneError
 from deepshade_workers import references
 from deepshade_workers.datagen import DataSpec, make_sample
-from deepshade_workers.render import render
-from deepshade_workers.sample import render_sample
+from deepshade_workers.render import render, render_sample
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.mesh import Object, merge
 from deepshade_workers.scenes.scene import SKY_RADIANCE, Scene

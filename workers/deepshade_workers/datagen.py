@@ -108,7 +108,7 @@ def make_sample(
     The sample's own random stream picks scene, view, radius and noise, so it doesn't matter
     which worker renders it, or when. `displacements` move the scene's objects (`view.View`).
     """
-    from deepshade_workers.sample import render_sample
+    from deepshade_workers.render import render_sample
     from deepshade_workers.scenes.loading import open_scene
     from deepshade_workers.viewpoints import sample_view
 

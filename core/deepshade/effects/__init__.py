@@ -10,12 +10,5 @@ from deepshade.effects.settings import SETTINGS, Setting
 
 __all__ = ["EFFECTS", "SETTINGS", "Effect", "Setting"]
 
-_OTHERS = {"effect", "settings"}
-
-
-def _rows() -> dict[str, Effect]:
-    names = sorted({module.name for module in iter_modules(__path__)} - _OTHERS)
-    return {name: import_module(f"{__name__}.{name}").EFFECT for name in names}
-
-
-EFFECTS: dict[str, Effect] = _rows()
+_NAMES = sorted({module.name for module in iter_modules(__path__)} - {"effect", "settings"})
+EFFECTS: dict[str, Effect] = {name: import_module(f"{__name__}.{name}").EFFECT for name in _NAMES}

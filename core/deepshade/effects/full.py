@@ -6,16 +6,7 @@ from deepshade.symmetry import ROTATIONS
 EFFECT = Effect(
     "full",
     "Full shading",
-    (
-        "normal_world",
-        "view",
-        "diffuse",
-        "specular",
-        "gloss",
-        "normal",
-        "position",
-        "focal",
-    ),
+    ("normal_world", "view", "diffuse", "specular", "gloss", "normal", "position", "focal"),
     "ibl weighted by ao, seen through a thin lens",
     lengths="radius",
     trivial="diffuse",

@@ -151,19 +151,9 @@ _LAYOUTS = {
     "compression": "<B",
     "lineOrder": "<B",
     "envmap": "<B",
-    "v2i": "<2i",
-    "v2f": "<2f",
-    "v2d": "<2d",
-    "v3i": "<3i",
-    "v3f": "<3f",
-    "v3d": "<3d",
+    **{f"v{count}{kind}": f"<{count}{kind}" for count in (2, 3) for kind in "ifd"},
     "box2i": "<4i",
     "box2f": "<4f",
     "tiledesc": "<2IB",
 }
-_MATRICES = {
-    "m33f": ("<f4", 3, 3),
-    "m33d": ("<f8", 3, 3),
-    "m44f": ("<f4", 4, 4),
-    "m44d": ("<f8", 4, 4),
-}
+_MATRICES = {f"m{n}{n}{kind}": (f"<{kind}", n, n) for n in (3, 4) for kind in "fd"}

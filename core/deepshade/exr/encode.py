@@ -39,14 +39,6 @@ _REQUIRED: dict[str, Any] = {  # unless the caller has others of the same type
     "screenWindowCenter": np.zeros(2, np.float32),
     "screenWindowWidth": 1.0,
 }
-_ARRAYS = {
-    ("i", (2,)): "v2i",
-    ("i", (3,)): "v3i",
-    ("f", (2,)): "v2f",
-    ("f", (3,)): "v3f",
-    ("f", (3, 3)): "m33f",
-    ("f", (4, 4)): "m44f",
-}
 
 
 def encode(
@@ -178,5 +170,6 @@ def _value(value: Any) -> tuple[str, bytes]:
     if isinstance(value, float):
         with np.errstate(over="ignore"):
             return "float", np.float32(value).astype("<f4").tobytes()
-    kind = _ARRAYS[value.dtype.kind, value.shape]
-    return kind, value.astype(value.dtype.newbyteorder("<")).tobytes()
+    kind = "v" if value.ndim == 1 else "m"
+    size = "".join(map(str, value.shape))
+    return f"{kind}{size}{value.dtype.kind}", value.astype(value.dtype.newbyteorder("<")).tobytes()

@@ -31,21 +31,11 @@ MAX_COORDINATE = 2**30 - 2  # OpenEXR's own bound on windows
 MAX_TILE = 2**16
 _BYTES = {"uint": 4, "half": 2, "float": 4}
 
-# code -> (name, scanlines in one chunk)
-_COMPRESSIONS = {
-    0: ("none", 1),
-    1: ("rle", 1),
-    2: ("zips", 1),
-    3: ("zip", 16),
-    4: ("piz", 32),
-    5: ("pxr24", 16),
-    6: ("b44", 32),
-    7: ("b44a", 32),
-    8: ("dwaa", 32),
-    9: ("dwab", 256),
-    10: ("htj2k256", 256),
-    11: ("htj2k32", 32),
-}
+# In the order of their codes. The last can only be read: the library writes the others.
+WRITABLE = ("none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256")
+_NAMES = (*WRITABLE, "htj2k32")
+# scanlines in a chunk of each
+_LINES = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256, 256, 32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,11 +162,11 @@ def _check_part(raw: RawPart, cursor: Cursor, flags: int, index: int, limits: Li
     decoded = width * height * pixel_bytes
 
     code = raw.attributes["compression"]
-    if code not in _COMPRESSIONS:
+    if code >= len(_NAMES):
         raise ImageError(
             f"{where}compression number {code} is unknown here", fix="save it with ZIP compression"
         )
-    compression, lines = _COMPRESSIONS[code]
+    compression, lines = _NAMES[code], _LINES[code]
     if compression.startswith("htj2k") and LIBRARY_VERSION < MIN_HTJ2K_VERSION:
         raise ImageError(
             f"{where}{compression} compression can't be read safely by the OpenEXR library here, "

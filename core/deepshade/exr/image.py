@@ -18,16 +18,15 @@ from deepshade.errors import ImageError
 from deepshade.exr import encode as exrencode
 from deepshade.exr.chunks import Window
 from deepshade.exr.decode import Wanted, decode
-from deepshade.exr.header import MAX_COORDINATE, Header, parse
+from deepshade.exr.header import MAX_COORDINATE, WRITABLE, Header, parse
 from deepshade.exr.limits import Limits
 from deepshade.files import replacing
 from deepshade.threads import thread_count
 
 Pixels = NDArray[np.float32]
 
-_NAMES = ("none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab", "htj2k256")
 COMPRESSIONS = {
-    name: getattr(OpenEXR, f"{name.replace('none', 'no').upper()}_COMPRESSION") for name in _NAMES
+    name: getattr(OpenEXR, f"{name.replace('none', 'no').upper()}_COMPRESSION") for name in WRITABLE
 }
 
 _pool_owner = 0  # the process that started the library's threads

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,7 +15,7 @@ from deepshade.camera import Camera, matrix_from_header
 from deepshade.errors import AmbiguousChannelError, CameraError, ImageError, MissingAttributeError
 from deepshade.exr import Header
 from deepshade.gbuffer import channels, derivation
-from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, Profile, detect
+from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, Profile, detect, number
 from deepshade.gbuffer.profiles import profile as profile_named
 from deepshade.gbuffer.suggestions import near_misses
 
@@ -167,12 +168,8 @@ def _camera(
     matrix: NDArray[np.float64] | None,
 ) -> Camera | None:
     if fov is None and profile is not None and "deepshade:fov" not in attributes:
-        for key in profile.fov:
-            try:
-                fov = float(attributes[key])
-                break
-            except (KeyError, TypeError, ValueError):
-                continue
+        found = number(attributes, *profile.fov)
+        fov = None if math.isnan(found) else found
     facts = {**attributes, "worldToCamera": None if matrix is None else matrix.T}
     return Camera.from_header(facts, part.data_window, part.display_window, fov=fov)
 

@@ -99,7 +99,8 @@ def _blender(header: Header) -> bool:
     return _signed("cycles.", "blender")(header) or str(header.get("File", "")).endswith(".blend")
 
 
-def _number(header: Header, *keys: str) -> float:
+def number(header: Header, *keys: str) -> float:
+    """The first of these attributes that is a number; NaN if none is."""
     for key in keys:
         try:
             return float(header[key])
@@ -111,7 +112,7 @@ def _number(header: Header, *keys: str) -> float:
 def _unreal_matrix(header: Header) -> NDArray[np.float64] | None:
     """World (left-handed, z up, x forward at zero rotation, cm) to our camera space."""
     place, turn = (
-        [_number(header, f"unreal/camera/{kind}/{axis}") for axis in axes]
+        [number(header, f"unreal/camera/{kind}/{axis}") for axis in axes]
         for kind, axes in (("curPos", "xyz"), ("curRot", ("pitch", "yaw", "roll")))
     )
     if not np.isfinite(place + turn).all():

@@ -5,13 +5,10 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from deepshade.attributes import ATTRIBUTES
+from deepshade.gbuffer.channels import Layer
 from deepshade.gbuffer.profiles import PROFILES
-
-if TYPE_CHECKING:
-    from deepshade.gbuffer.channels import Layer
 
 # Names come from strangers: what is compared for a hint is bounded, whatever a file holds.
 MAX_NAME = 64

@@ -98,10 +98,6 @@ class Mesh:
         """The same triangles with their corners in the other order, and so facing the other way."""
         return replace(self, faces=self.faces[:, ::-1], normals=self.normals[:, ::-1])
 
-    def with_material(self, material: Material) -> Mesh:
-        """The same triangles made of one `material`."""
-        return replace(self, materials=np.tile(material.row(), (len(self.faces), 1)))
-
 
 def merge(meshes: Iterable[Mesh], names: Sequence[str] = ()) -> Mesh:
     """One mesh of all, so that a ray tracer sees a single shape.

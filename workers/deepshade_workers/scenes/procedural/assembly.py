@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
-from deepshade_workers.scenes.mesh import Floats, Material, Mesh, merge
+from deepshade_workers.scenes.mesh import Floats, Mesh, merge
 from deepshade_workers.scenes.procedural.primitives import Rng, along, box, cylinder, place
 
-Size = tuple[float, float, float]
+Triple = tuple[float, float, float] | Floats
 
 # How many materials scatter light below their surface, and how far it gets (scene units).
 SCATTERING_SHARE = 0.4
@@ -31,39 +32,30 @@ class Assembly:
         self._coats = 0
         self.paint()
 
-    def _draw_material(self) -> Material:
-        rng = self.rng
-        diffuse = rng.uniform(0.15, 0.9) * (1 - rng.uniform(0, 0.5) * rng.random(3))
-        shine = rng.uniform(0, 0.3)
-        gloss = float(2 ** rng.uniform(1, 8))
-        r, g, b = (float(v) for v in diffuse)
-        return Material((r, g, b), (shine, shine, shine), gloss, self._draw_scatter())
-
-    def _draw_scatter(self) -> tuple[float, float, float]:
-        rng = self._scatter_rng
-        scatters = rng.random() < SCATTERING_SHARE
-        farthest = np.exp(rng.uniform(*np.log(MEAN_FREE_PATHS)))
-        r, g, b = (float(v) for v in scatters * farthest * rng.uniform(0.2, 1, 3))
-        return r, g, b
-
     def paint(self) -> None:
         """Begin a new object, of a new material."""
-        self.material = self._draw_material()
+        rng, scatter_rng = self.rng, self._scatter_rng
+        diffuse = rng.uniform(0.15, 0.9) * (1 - rng.uniform(0, 0.5) * rng.random(3))
+        shine = rng.uniform(0, 0.3)
+        gloss = 2 ** rng.uniform(1, 8)
+        scatters = scatter_rng.random() < SCATTERING_SHARE
+        farthest = np.exp(scatter_rng.uniform(*np.log(MEAN_FREE_PATHS)))
+        scatter = scatters * farthest * scatter_rng.uniform(0.2, 1, 3)
+        self._material = np.array([*diffuse, shine, shine, shine, gloss, *scatter])  # Material.row
         self._coats += 1
 
     def add(self, mesh: Mesh, matrix: Floats | None = None) -> None:
         """Place `mesh` by a (4, 4) `matrix`."""
         placed = mesh if matrix is None else mesh.transformed(matrix)
-        self._parts.append(placed.with_material(self.material))
+        rows = np.tile(self._material, (len(placed.faces), 1))
+        self._parts.append(replace(placed, materials=rows))
         self._names.append(f"object {self._coats}")
 
-    def box(
-        self, center: Size | Floats, size: Size | Floats, rotation: Floats | None = None
-    ) -> None:
+    def box(self, center: Triple, size: Triple, rotation: Floats | None = None) -> None:
         """Place a box by its centre and full size."""
         self.add(box(), place(center, size, rotation))
 
-    def boxes_at(self, at: Floats, turn: Floats) -> Callable[[Size, Size], None]:
+    def boxes_at(self, at: Floats, turn: Floats) -> Callable[[Triple, Triple], None]:
         """A function that places a box by its offset from `at` and its size, turned by `turn`."""
         return lambda offset, size: self.box(at + turn @ np.array(offset), size, turn)
 
