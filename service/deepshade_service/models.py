@@ -102,7 +102,7 @@ class Models:
         return choose(bundle, *pins)
 
     async def engine(self, bundle: Bundle, backend: Backend) -> Engine:
-        """The bundle's engine, warm. Who asks while it is loaded waits for that one.
+        """The bundle's engine. Who asks while it is loaded waits for that one.
 
         Raises Problem 500 when a library refuses the graph.
         """
@@ -115,11 +115,15 @@ class Models:
         return await asyncio.shield(self._loading[key])
 
     async def ms_per_megapixel(self, bundle: Bundle, backend: Backend) -> float:
-        """What the network takes, as timed when its engine was first loaded: never anew, so that
-        the same request gets the same bundle."""
-        if (bundle.path, backend) not in self._speeds:
-            await self.engine(bundle, backend)
-        return self._speeds[bundle.path, backend]
+        """What the network takes, as timed while it warms up, when that is first asked: never
+        anew, so that the same request gets the same bundle."""
+        key = bundle.path, backend
+        if key not in self._speeds:
+            engine = await self.engine(bundle, backend)
+            await asyncio.to_thread(engine.warm)
+            runs = 3 if bundle.per_channel else 1
+            self._speeds.setdefault(key, runs * engine.ms_per_megapixel)
+        return self._speeds[key]
 
     def engines(self) -> list[Engine]:
         """Those in memory."""
@@ -128,7 +132,7 @@ class Models:
     async def _load(self, key: Key, bundle: Bundle) -> Engine:
         label = f"{bundle.effect}/{bundle.name}"
         try:
-            engine = await asyncio.to_thread(self._warmed, bundle, key[1])
+            engine = await asyncio.to_thread(load_engine, bundle, key[1], threads=self._threads)
         except Exception as error:  # libraries raise what they like
             log.exception("bundle %s can't be loaded on %s", label, key[1])
             raise Problem(
@@ -140,15 +144,9 @@ class Models:
         finally:
             del self._loading[key]
         log.info("bundle %s is loaded on %s", label, key[1])
-        self._speeds.setdefault(key, engine.ms_per_megapixel * (3 if bundle.per_channel else 1))
         self._engines[key] = engine
         if len(self._engines) > MAX_ENGINES:
             self._engines.popitem(last=False)
-        return engine
-
-    def _warmed(self, bundle: Bundle, backend: Backend) -> Engine:
-        engine = load_engine(bundle, backend, threads=self._threads)
-        engine.warm()
         return engine
 
 

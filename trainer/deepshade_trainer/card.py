@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from deepshade import bench
 from deepshade.bundles import Bundle, write_config
 from deepshade.effects import EFFECTS
-from deepshade.engines import Backend, available, load_engine
+from deepshade.engines import usable
 from deepshade.files import replacing
-from deepshade.machine import cpu_count, cpu_kind, describe
-from deepshade.tensors import channel_slices, up
+from deepshade.machine import cpu_kind, describe
 from deepshade_trainer.dataset import directions, lengths
 from deepshade_trainer.evaluation import Variant, evaluate, summary
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
 
-SPEED_SIZE = (768, 512)
 MAX_INT8_ADDED = 0.01  # of the DSSIM in fp32
 _WRITTEN = ("path", "metrics", "hashes")
 _COLUMNS = {"ssim": ".4f", "psnr": ".2f", "mae": ".4f", "flip": ".4f", "smape": ".4f"}
@@ -54,7 +50,7 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
         found = errors[folder.name]
         for name, variant in variants(bundle).items():
             found[name] = summary(list(evaluate(bundle, [folder], variant=variant)))
-        for backend in _backends(bundle):
+        for backend in usable(bundle):
             if backend.precision != "fp32":
                 mean = summary(list(evaluate(bundle, [folder], backend=backend)))
                 found[f"exact, {backend}"] = mean
@@ -67,39 +63,13 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
     ]
     if added and max(added) <= MAX_INT8_ADDED:
         kinds.add(cpu_kind())
-    speeds = {**bundle.metrics.get("speed", {}), describe(): speed(bundle)}
+    speeds = {
+        **bundle.metrics.get("speed", {}),
+        describe(): {"size": [bench.WIDTH, bench.HEIGHT], "ms": bench.milliseconds(bundle)},
+    }
     metrics = {**bundle.metrics, "error": errors, "speed": speeds}
     config = {f.name: getattr(bundle, f.name) for f in fields(bundle) if f.name not in _WRITTEN}
     return write_config(bundle.path, {**config, "int8_kinds": sorted(kinds)}, metrics)
-
-
-def _backends(bundle: Bundle) -> list[Backend]:
-    """The backends of this machine that run the bundle."""
-    return [backend for backend in available() if backend.precision != "int8" or bundle.int8]
-
-
-def speed(bundle: Bundle, repeats: int = 9) -> dict[str, Any]:
-    """Median milliseconds of the bare network at `SPEED_SIZE`, of each backend in turns."""
-    width, height = SPEED_SIZE
-    rows, columns = up(height, bundle.size_multiple), up(width, bundle.size_multiple)
-    rng = np.random.default_rng(0)
-    gbuffer = rng.normal(size=(1, bundle.channels, rows, columns)).astype(np.float32)
-    if place := channel_slices(bundle.inputs, bundle.per_channel).get("position"):
-        gbuffer[:, place.stop - 1] = -np.abs(gbuffer[:, place.stop - 1]) - 4
-    backends = _backends(bundle)
-    engines = [load_engine(bundle, backend, threads=cpu_count()) for backend in backends]
-    for engine in engines:
-        engine.warm()
-        engine.prepare(rows, columns)
-    times: dict[str, list[float]] = {str(backend): [] for backend in backends}
-    for turn in range(repeats + 2):
-        for engine in engines:
-            start = time.perf_counter()
-            engine.predict(gbuffer)
-            if turn > 1:
-                times[str(engine.backend)].append(1e3 * (time.perf_counter() - start))
-    medians = {name: round(float(np.median(taken)), 2) for name, taken in times.items()}
-    return {"size": [width, height], "ms": medians}
 
 
 def write_card(bundle: Bundle, run: Run, note: str) -> None:

@@ -10,7 +10,7 @@ Nothing heavy is imported before it is asked for.
 """
 
 from deepshade.engines.base import Backend, Engine
-from deepshade.engines.registry import REFERENCE, available, choose, load_engine
+from deepshade.engines.registry import REFERENCE, available, choose, load_engine, usable
 from deepshade.errors import EngineError
 
 __all__ = [
@@ -21,4 +21,5 @@ __all__ = [
     "available",
     "choose",
     "load_engine",
+    "usable",
 ]

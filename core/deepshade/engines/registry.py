@@ -42,6 +42,11 @@ def available() -> tuple[Backend, ...]:
     return tuple(found)
 
 
+def usable(bundle: Bundle) -> list[Backend]:
+    """`available`, less 8 bits where the bundle has no ranges for them."""
+    return [one for one in available() if one.precision != "int8" or bundle.int8]
+
+
 def choose(bundle: Bundle, engine: str | None = None, precision: str | None = None) -> Backend:
     """The backend that a bundle runs on here: the first of the rule that is as asked.
 
@@ -50,15 +55,14 @@ def choose(bundle: Bundle, engine: str | None = None, precision: str | None = No
     fp32. The rule looks at the machine and the bundle alone, so a request gets the same bytes
     always. Raises EngineError if none is as asked.
     """
-    able = [b for b in available() if b.precision != "int8" or bundle.int8]
-    for backend in able:
+    for backend in usable(bundle):
         unproven = backend.precision == "int8" and cpu_kind() not in bundle.int8_kinds
         if engine not in (None, backend.engine) or precision not in (None, backend.precision):
             continue
         if not unproven or precision == "int8":
             return backend
     asked = "/".join(part or "*" for part in (engine, precision))
-    here = ", ".join(map(str, able))
+    here = ", ".join(map(str, usable(bundle)))
     raise EngineError(
         f"no '{asked[:100]}' for this bundle on this machine" if here else "no engine is installed",
         fix=f"one of: {here}" if here else "pip install 'deepshade[service]'",
