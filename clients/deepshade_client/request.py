@@ -73,7 +73,9 @@ def shade_request(
 
     One file is sent as the body, several as a form. Raises OSError for a file that can't be read.
     """
-    query = (options or Options()).query() + [("explain", "true")] * explain
+    query = (options or Options()).query()
+    if explain:
+        query.append(("explain", "true"))
     request = {"method": "POST", "url": f"shade/{quote(effect, safe='')}", "params": query}
     if isinstance(picture, (str, bytes, Path)):
         _, data = _named(picture)

@@ -63,12 +63,12 @@ def encode(
     if lines * line_bytes > MAX_CHUNK:
         raise ValueError(f"{lines} scanlines of {line_bytes:,} bytes are too much for a chunk")
     layout = struct.Struct("<iB3xii")  # pixel type, linear, and every pixel is sampled
-    pixel_types = b"".join(
+    channel_list = b"".join(
         _name(name) + layout.pack(_HALF if name in half else _FLOAT, 0, 1, 1)
         for name in sorted(channels)
     )
     structure = {
-        "channels": ("chlist", pixel_types + bytes(1)),
+        "channels": ("chlist", channel_list + bytes(1)),
         "compression": ("compression", bytes([code])),
         "dataWindow": ("box2i", struct.pack("<4i", *data_window)),
         "displayWindow": ("box2i", struct.pack("<4i", *display_window)),
@@ -170,6 +170,7 @@ def _value(value: Any) -> tuple[str, bytes]:
     if isinstance(value, float):
         with np.errstate(over="ignore"):
             return "float", np.float32(value).astype("<f4").tobytes()
-    kind = "v" if value.ndim == 1 else "m"
-    size = "".join(map(str, value.shape))
-    return f"{kind}{size}{value.dtype.kind}", value.astype(value.dtype.newbyteorder("<")).tobytes()
+    vector_or_matrix = "v" if value.ndim == 1 else "m"
+    sides = "".join(map(str, value.shape))  # as in v3f or m44f
+    stored = value.astype(value.dtype.newbyteorder("<")).tobytes()
+    return f"{vector_or_matrix}{sides}{value.dtype.kind}", stored

@@ -123,9 +123,7 @@ def _material(visual: Any) -> Material:
     alpha = max(_unit(getattr(material, "roughnessFactor", None), 0.6) ** 2, 0.03)
     diffuse = np.clip(base * (1 - metallic), 0, 1)
     specular = np.clip(0.04 * (1 - metallic) + base * metallic, 0, 1)
-    r, g, b = (float(v) for v in diffuse)
-    sr, sg, sb = (float(v) for v in specular)
-    return Material((r, g, b), (sr, sg, sb), float(max(2 / alpha**2 - 2, 1.0)))
+    return Material(tuple(diffuse), tuple(specular), float(max(2 / alpha**2 - 2, 1.0)))
 
 
 def _mean_colour(texture: Any) -> np.ndarray:

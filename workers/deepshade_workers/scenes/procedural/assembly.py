@@ -41,7 +41,8 @@ class Assembly:
         scatters = scatter_rng.random() < SCATTERING_SHARE
         farthest = np.exp(scatter_rng.uniform(*np.log(MEAN_FREE_PATHS)))
         scatter = scatters * farthest * scatter_rng.uniform(0.2, 1, 3)
-        self._material = np.array([*diffuse, shine, shine, shine, gloss, *scatter])  # Material.row
+        # in the order of Material.row
+        self._material = np.array([*diffuse, shine, shine, shine, gloss, *scatter])
         self._coats += 1
 
     def add(self, mesh: Mesh, matrix: Floats | None = None) -> None:
