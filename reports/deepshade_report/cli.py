@@ -44,7 +44,7 @@ def report(
       deepshade report --only service --only sizes
     """
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress, TextColumn
 
     from deepshade.bundles import bundle_root
     from deepshade.effects import EFFECTS
@@ -55,30 +55,19 @@ def report(
 
     for name in only or ():
         if name not in SECTIONS:
-            raise ConfigError(
-                name, SECTIONS, detail=f"no section is called '{name}': {', '.join(SECTIONS)}"
-            )
+            detail = f"no section is called '{name}': {', '.join(SECTIONS)}"
+            raise ConfigError(name, SECTIONS, detail=detail)
     if effect not in EFFECTS:
         raise ConfigError(effect, EFFECTS, detail=f"no effect is called '{effect}'")
     threads = threads or cpu_count()
     context = Context(models or bundle_root(), data, out, paper, effect, threads, quick, views)
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description:11}"),
-        BarColumn(),
-        TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[doing]}"),
-    )
-    wanted = [name for name in SECTIONS if not only or name in only]
-    total = sum(SECTIONS[name][1] for name in wanted)
+    columns = (*Progress.get_default_columns(), TextColumn("{task.fields[doing]}"))
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=total, doing="")
+        task = bar.add_task("", total=1.0, doing="")
 
         def show(section: str, share: float, doing: str) -> None:
-            before = sum(SECTIONS[name][1] for name in wanted[: wanted.index(section)])
-            done = before + share * SECTIONS[section][1]
-            bar.update(task, completed=done, description=section, doing=doing[:60])
+            bar.update(task, completed=share, description=section, doing=doing[:60])
 
         try:
             found = measure(context, only=only or (), resume=resume, progress=show)

@@ -8,17 +8,18 @@ import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
-from deepshade.bundles import Bundle
+from deepshade.bundles import Bundle, bundle_folders
 from deepshade.errors import ConfigError
 from deepshade.machine import cpu_count, describe, memory_bytes
-from deepshade_report.method import bundles, paper_bundle
+from deepshade_report.method import PAPER
 from deepshade_report.timing import Pace
 from deepshade_report.view import View, load_views
 
+_QUALITIES = ("fast", "balanced", "best")  # of shipped bundles, which come first
 _PACKAGES = ("deepshade", "numpy", "onnxruntime", "openvino", "OpenEXR", "mitsuba", "mitsuba-oidn")
 
 
@@ -43,17 +44,26 @@ class Context:
 
     @cached_property
     def served(self) -> list[Bundle]:
-        """The bundles of the service. Raises ConfigError without one."""
-        found = bundles(self.models, self.effect)
+        """The bundles that the service offers, from fast to best. Raises ConfigError without one.
+
+        Raises BundleError for a damaged one.
+        """
+        folders = [path for path in bundle_folders(self.models) if path.parent.name == self.effect]
+        found = [Bundle.load(path) for path in folders if path.name != PAPER]
         if not found:
             detail = f"{self.models} holds no bundle for '{self.effect}'"
             raise ConfigError("models", detail=f"{detail}: train and export one, or set --models")
-        return found
+        rank = {name: index for index, name in enumerate(_QUALITIES)}
+        return sorted(found, key=lambda bundle: (rank.get(bundle.name, len(rank)), bundle.name))
 
     @cached_property
     def paper_network(self) -> Bundle | None:
-        """The paper's network, if there is one."""
-        return paper_bundle(self.paper, self.models, self.effect)
+        """The paper's network: what --paper names, else models/<effect>/paper, else None.
+
+        Raises BundleError when the named folder holds none.
+        """
+        folder = self.paper or self.models / self.effect / PAPER
+        return Bundle.load(folder) if self.paper or folder.is_dir() else None
 
     @cached_property
     def views(self) -> list[View]:
@@ -65,6 +75,13 @@ class Context:
         """A section's time; quick reports take a tenth of it, and two rounds."""
         return Pace(seconds / 10, 2, 5) if self.quick else Pace(seconds, min_rounds, max_rounds)
 
+    def options(self) -> dict[str, Any]:
+        """What was asked for, as JSON values."""
+        places = {"models": self.models, "data": self.data, "paper": self.paper}
+        asked: dict[str, Any] = {name: path and str(path) for name, path in places.items()}
+        asked |= {"effect": self.effect, "threads": self.threads}
+        return asked | {"quick": self.quick, "views": self.max_views}
+
     def key(self) -> str:
         """Stamps sections: they are kept only for the same bundles, data, machine and settings."""
         hashes = [b.sha256 for b in (*self.served, self.paper_network) if b]
@@ -75,16 +92,11 @@ class Context:
 
 def machine() -> dict[str, Any]:
     """The machine and what runs on it, by name and version."""
-    versions = {}
-    for name in _PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
+    versions = {found.name: found.version for found in distributions() if found.name in _PACKAGES}
     return {
         "processor": describe(),
         "memory_gib": round(memory_bytes() / 2**30, 1),
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
-        "versions": versions,
+        "versions": dict(sorted(versions.items())),
     }

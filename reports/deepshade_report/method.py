@@ -1,22 +1,19 @@
-"""What is compared: bundles on engines, the paper's network, and the interface of baselines."""
+"""What is compared: the interface of all methods, and a bundle's network on an engine."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from deepshade import tensors
-from deepshade.bundles import Bundle, bundle_folders
+from deepshade.bundles import Bundle
 from deepshade.engines import Engine, available, load_engine
 from deepshade.errors import DeepshadeError
 from deepshade_report.view import Float, View
 
-QUALITIES = ("fast", "balanced", "best")
-PAPER = "paper"
+PAPER = "paper"  # the name of the bundle that is a baseline
 NETWORK, PAPER_NETWORK = "network", "paper's network"
 
 
@@ -40,18 +37,14 @@ class Method(Protocol):
         ...
 
 
-@dataclass
 class Network:
     """A bundle's bare network on one engine, as a Method: input ready, nothing skipped."""
 
-    bundle: Bundle
-    engine: Engine
-    name: str
-    family: str = NETWORK
-    settings: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        backend = self.engine.backend
+    def __init__(self, bundle: Bundle, engine: Engine, *, is_paper: bool = False) -> None:
+        self.bundle, self.engine = bundle, engine
+        self.name = PAPER if is_paper else bundle.name
+        self.family = PAPER_NETWORK if is_paper else NETWORK
+        backend = engine.backend
         self.settings = {"engine": backend.engine, "precision": backend.precision}
         self._ready: Float = np.empty((1, 0, 0, 0), np.float32)
 
@@ -78,42 +71,21 @@ class Network:
         return answer.reshape(-1, *answer.shape[2:])[:, : view.height, : view.width]
 
 
-def bundles(models: Path, effect: str) -> list[Bundle]:
-    """The served bundles of an effect, the shipped qualities first, from fast to best.
-
-    Raises BundleError for a damaged one. One called `paper` is the baseline, not served.
-    """
-    folders = [path for path in bundle_folders(models) if path.parent.name == effect]
-    found = [Bundle.load(path) for path in folders if path.name != PAPER]
-    rank = {name: index for index, name in enumerate(QUALITIES)}
-    return sorted(found, key=lambda bundle: (rank.get(bundle.name, len(rank)), bundle.name))
-
-
-def paper_bundle(paper: Path | None, models: Path, effect: str) -> Bundle | None:
-    """The paper's network: the folder that was named, else models/<effect>/paper, else None.
-
-    Raises BundleError when the named folder holds none.
-    """
-    folder = paper or models / effect / PAPER
-    return Bundle.load(folder) if paper or folder.is_dir() else None
-
-
 def networks(served: list[Bundle], paper: Bundle | None, threads: int) -> Iterator[Network]:
     """Every bundle on every backend that this machine has; what can't be loaded is left out."""
     for bundle in [*served, *([paper] if paper else [])]:
-        name, family = (PAPER, PAPER_NETWORK) if bundle is paper else (bundle.name, NETWORK)
         for backend in available():
             try:
                 engine = load_engine(bundle, backend, threads=threads)
                 engine.warm()
             except DeepshadeError:
                 continue
-            yield Network(bundle, engine, name, family)
+            yield Network(bundle, engine, is_paper=bundle is paper)
 
 
 def identity(method: Method) -> str:
     """One line that tells the method and its settings from all others."""
     settings = method.settings
-    if {"engine", "precision"} <= set(settings):
+    if isinstance(method, Network):
         return f"{method.name} {settings['engine']}/{settings['precision']}"
     return " ".join([method.name, *(f"{key}={value}" for key, value in settings.items())])

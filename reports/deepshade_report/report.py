@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import http.client
 import json
-import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any
@@ -28,16 +27,13 @@ from deepshade_report.sections import (
     summary,
 )
 
-# name -> what measures it, and about how many seconds that takes on two cores
-SECTIONS: dict[str, tuple[Callable[[Context], dict[str, Any]], int]] = {
-    "error": (methods.error, 150),
-    "speed": (methods.speed, 120),
-    "service": (service.service, 60),
-    "sizes": (sizes.sizes, 140),
-    "comparison": (comparison.comparison, 10),
+SECTIONS: dict[str, Callable[[Context], dict[str, Any]]] = {
+    "error": methods.error,
+    "speed": methods.speed,
+    "service": service.service,
+    "sizes": sizes.sizes,
+    "comparison": comparison.comparison,
 }
-
-Progress = Callable[[str, float, str], None]
 
 
 def measure(
@@ -45,7 +41,7 @@ def measure(
     *,
     only: Collection[str] = (),
     resume: bool = False,
-    progress: Progress = lambda section, share, doing: None,
+    progress: Callable[[str, float, str], None] = lambda section, share, doing: None,
 ) -> dict[str, Any]:
     """The report, which is also written into the context's folder after each section.
 
@@ -55,23 +51,20 @@ def measure(
     Raises ConfigError or DataError where there is nothing to measure: no bundle, no views.
     """
     context.served, context.views  # noqa: B018 - raise before anything is measured
-    began, key = time.perf_counter(), context.key()
-    wanted = [name for name in SECTIONS if not only or name in only]
+    key = context.key()
     before = kept(context, key)
-    sections: Sections = {}
-    for name in SECTIONS:
-        done = before.get(name, {}).get("status") == "done"
-        if name in before and (name not in wanted or (resume and done)):
-            sections[name] = before[name]
+    again = [name for name in SECTIONS if not only or name in only]
+    if resume:
+        again = [name for name in again if before.get(name, {}).get("status") != "done"]
+    sections = {name: found for name, found in before.items() if name not in again}
     context.measured = sections
-    report = document(context, sections, key, 0.0)
-    for name in [name for name in wanted if name not in sections]:
+    report = document(context, sections, key)
+    for name in again:
         context.advance = partial(progress, name)
         context.advance(0.0, "")
         sections[name] = _one(context, name)
-        progress(name, 1.0, "")
-        ordered = {name: sections[name] for name in SECTIONS if name in sections}
-        report = document(context, ordered, key, time.perf_counter() - began)
+        context.advance(1.0, "")
+        report = document(context, sections, key)
         write(context, report)
     return report
 
@@ -88,60 +81,40 @@ def kept(context: Context, key: str) -> Sections:
 def _one(context: Context, name: str) -> dict[str, Any]:
     start = time.perf_counter()
     try:
-        figures = SECTIONS[name][0](context)
+        figures = SECTIONS[name](context)
     except (Skipped, DeepshadeError, OSError, http.client.HTTPException) as error:
         return {"status": "skipped", "reason": f"{error} {getattr(error, 'fix', '')}".strip()}
-    seconds = round(time.perf_counter() - start, 1)
-    return {"status": "done", "seconds": seconds, "data": finite(figures)}
+    # as a file gives it back, with None for what is not finite
+    plain = json.loads(json.dumps(figures), parse_constant=lambda _: None)
+    return {"status": "done", "seconds": round(time.perf_counter() - start, 1), "data": plain}
 
 
-def document(context: Context, sections: Sections, key: str, seconds: float) -> dict[str, Any]:
+def document(context: Context, sections: Sections, key: str) -> dict[str, Any]:
     """The report as JSON values."""
     return {
         "format": "deepshade-report",
         "version": 2,
         "made": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "seconds": round(seconds, 1),
         "key": key,
         "machine": machine(),
-        "options": {
-            "effect": context.effect,
-            "models": str(context.models),
-            "data": str(context.data),
-            "paper": str(context.paper) if context.paper else None,
-            "threads": context.threads,
-            "quick": context.quick,
-            "views": context.max_views,
-        },
+        "options": context.options(),
         "summary": summary(sections),
         "same_time": same_time(sections),
         "frontier": [point.id for point in frontier(points(sections))],
-        "sections": sections,
+        "sections": {name: sections[name] for name in SECTIONS if name in sections},
     }
 
 
 def write(context: Context, report: dict[str, Any]) -> None:
-    """report.json, the plots as PNG, and index.html, each replaced as a whole."""
+    """report.json, speed-error.png and index.html."""
     context.out.mkdir(parents=True, exist_ok=True)
-    for name, plot in plots.PLOTS.items():
-        target = context.out / f"{name}.png"
-        target.unlink(missing_ok=True)  # of an earlier report
-        with plots.themed():
-            if (drawn := plot(report["sections"], context.effect)) is not None:
-                target.write_bytes(plots.png(drawn))
-    names = (*plots.PLOTS, "comparison")
-    pictures = {name: context.out / f"{name}.png" for name in names}
-    images = {name: path.read_bytes() for name, path in pictures.items() if path.exists()}
+    images: dict[str, bytes] = {}
+    if drawn := plots.speed_error(report["sections"], context.effect):
+        images["speed-error"] = drawn
+        (context.out / "speed-error.png").write_bytes(drawn)
+    if (picture := context.out / comparison.PICTURE).exists():
+        images["comparison"] = picture.read_bytes()
     with replacing(context.out / "report.json") as temporary:
         temporary.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", "utf-8")
     with replacing(context.out / "index.html") as temporary:
         temporary.write_text(page.render(report, images), "utf-8")
-
-
-def finite(value: Any) -> Any:
-    """The same data as JSON knows it: tuples as lists, and None for what is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -15,38 +15,39 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
+from urllib.request import urlopen
 
 from deepshade.errors import DeepshadeError
 
 STAGES = ("decode", "plan", "infer", "encode")
 _MAIN = "import sys; from deepshade.cli import main; sys.exit(main())"
-_START = 90.0  # seconds for the service to become ready
+_MAX_START = 90.0  # seconds for the service to become ready
+_MAX_IDLE = 2.0  # seconds after which the service may have closed a connection
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """One answer: its status, headers in lower case, content, and the client's milliseconds."""
+    """An answer's headers, in lower case, and the milliseconds that its client waited."""
 
-    status: int
     headers: dict[str, str]
-    content: bytes
     milliseconds: float
-
-    @property
-    def stages(self) -> dict[str, float]:
-        """Milliseconds of the service's stages, from Server-Timing."""
-        found = re.findall(r"([\w-]+);dur=(\d+(?:\.\d+)?)", self.headers.get("server-timing", ""))
-        return {name: float(value) for name, value in found if name in STAGES}
-
-    @property
-    def server(self) -> float:
-        """Milliseconds of all stages together."""
-        return sum(self.stages.values())
 
     @property
     def backend(self) -> str:
         """What the answer says that it was made with, as "openvino/bf16"."""
         return "/".join(self.headers[f"deepshade-{name}"] for name in ("engine", "precision"))
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Milliseconds of each stage, their "total", the client's and "transport" beside; "tiles".
+
+        Stages are those of Server-Timing.
+        """
+        found = re.findall(r"([\w-]+);dur=(\d+(?:\.\d+)?)", self.headers["server-timing"])
+        stages = {name: float(value) for name, value in found if name in STAGES}
+        total = sum(stages.values())
+        waited = {"client": self.milliseconds, "transport": self.milliseconds - total}
+        return {**stages, **waited, "total": total, "tiles": float(self.headers["deepshade-tiles"])}
 
 
 class Server:
@@ -68,46 +69,30 @@ class Server:
             start_new_session=True,  # Ctrl-C is ours to handle; we stop it in `stop`
         )
         self._http = http.client.HTTPConnection("127.0.0.1", port, timeout=600.0)
+        self._asked = 0.0
         try:
             self._wait()
         except BaseException:
             self.stop()
             raise
 
-    def ask(self, method: str, path: str, body: bytes | None = None) -> Reply:
-        """Send one request, read its whole answer. Raises OSError, http.client.HTTPException."""
-        headers = {"Content-Type": "image/x-exr"} if body is not None else {}
+    def shade(self, path: str, body: bytes) -> Reply:
+        """POST a picture. Raises DeepshadeError for any answer but 200.
+
+        Raises OSError or http.client.HTTPException where there is no answer.
+        """
+        if time.monotonic() - self._asked > _MAX_IDLE:
+            self._http.close()  # and the request opens it
         start = time.perf_counter()
-        try:
-            self._http.request(method, path, body, headers)
-            response = self._http.getresponse()
-        except (http.client.RemoteDisconnected, ConnectionError):  # it was idle for too long
-            self._http.close()
-            start = time.perf_counter()
-            self._http.request(method, path, body, headers)
-            response = self._http.getresponse()
+        self._http.request("POST", path, body, {"Content-Type": "image/x-exr"})
+        response = self._http.getresponse()
         content = response.read()
         took = 1e3 * (time.perf_counter() - start)
-        names = {name.lower(): value for name, value in response.getheaders()}
-        return Reply(response.status, names, content, took)
-
-    def shade(self, path: str, body: bytes) -> Reply:
-        """POST a picture. Raises DeepshadeError for any answer but 200."""
-        reply = self.ask("POST", path, body)
-        if reply.status != 200:
-            said = reply.content[:400].decode("utf-8", "replace")
-            raise DeepshadeError(f"POST {path} was answered with {reply.status}: {said}")
-        return reply
-
-    @property
-    def resident(self) -> int:
-        """Bytes of its physical memory now; 0 where the system doesn't say."""
-        return self._status("VmRSS")
-
-    @property
-    def peak(self) -> int:
-        """The most bytes of physical memory since `forget_peak`; 0 where it isn't known."""
-        return self._status("VmHWM")
+        self._asked = time.monotonic()
+        if response.status != 200:
+            said = content[:400].decode("utf-8", "replace")
+            raise DeepshadeError(f"POST {path} was answered with {response.status}: {said}")
+        return Reply({name.lower(): value for name, value in response.getheaders()}, took)
 
     def forget_peak(self) -> bool:
         """Let `peak` begin anew; False where the system can't."""
@@ -117,14 +102,19 @@ class Server:
             return False
         return True
 
-    def settle(self, seconds: float = 3.0) -> int:
-        """`resident` once it has stopped falling: memory is handed back when work has ended."""
+    @property
+    def peak(self) -> int:
+        """The most bytes of physical memory since `forget_peak`; 0 where it isn't known."""
+        return self._memory("VmHWM")
+
+    def settle(self, seconds: float) -> int:
+        """The least bytes of physical memory while it hands back what it doesn't need."""
         deadline = time.monotonic() + seconds
-        lowest = self.resident
+        least = self._memory("VmRSS")
         while time.monotonic() < deadline:
             time.sleep(0.05)
-            lowest = min(lowest, self.resident)
-        return lowest
+            least = min(least, self._memory("VmRSS"))
+        return least
 
     def stop(self) -> None:
         """End it, by force if it doesn't end within 20 s."""
@@ -145,18 +135,16 @@ class Server:
 
     def _wait(self) -> None:
         """Until it is ready. Raises DeepshadeError with what it printed where it isn't."""
-        deadline = time.monotonic() + _START
+        deadline = time.monotonic() + _MAX_START
         while time.monotonic() < deadline and self.process.poll() is None:
-            with suppress(OSError, http.client.HTTPException):
-                if self.ask("GET", "/readyz").status == 200:
-                    return
-            self._http.close()
+            with suppress(OSError), urlopen(f"http://127.0.0.1:{self._http.port}/readyz"):
+                return
             time.sleep(0.1)
         self._log.seek(0)
         last = self._log.read().decode("utf-8", "replace").strip().splitlines()[-3:]
         raise DeepshadeError(f"the service doesn't start: {' '.join(last) or 'it said nothing'}")
 
-    def _status(self, field: str) -> int:
+    def _memory(self, field: str) -> int:
         with suppress(OSError):
             text = Path(f"/proc/{self.process.pid}/status").read_text()
             if match := re.search(rf"^{field}:\s+(\d+) kB", text, re.MULTILINE):

@@ -16,15 +16,11 @@ _PAUSE = 0.004  # seconds in which the previous library's threads stop spinning
 _BURST = 0.05  # seconds of one task before it is another's turn, at least one run
 _MAX_RUNS = 8  # of a burst
 _SLOW = 0.25  # seconds from which on a run needs no untimed one before it
-_DIGITS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How long to measure: seconds for all rounds together, and the least and most rounds.
-
-    Once `seconds` are over no new round begins, unless fewer than `min_rounds` were made.
-    """
+    """How long to measure: no round begins after `seconds`, unless `min_rounds` weren't made."""
 
     seconds: float
     min_rounds: int = 3
@@ -48,55 +44,45 @@ def alternate(
     is done, 0 to 1, and which task comes next. `clock` and `pause` are for tests.
     """
 
-    def run(name: str) -> tuple[float, dict[str, float]]:
+    def run(name: str) -> dict[str, float]:
         begin = clock()
         told = tasks[name]()
         ms = 1e3 * (clock() - begin)
-        figures = {"ms": ms, **(told if isinstance(told, dict) else {})}
-        return figures["ms"], figures
+        return {"ms": ms, **(told if isinstance(told, dict) else {})}
 
-    typical: dict[str, float] = {}
+    typical: dict[str, float] = {}  # seconds of a run
     for name in tasks:
         advance(0.0, name)
-        typical[name] = max(run(name)[0] / 1e3, 1e-7)  # sets up what later runs reuse
+        typical[name] = run(name)["ms"] / 1e3  # sets up what later runs reuse
         if typical[name] < _SLOW:
-            typical[name] = max(run(name)[0] / 1e3, 1e-7)
+            typical[name] = run(name)["ms"] / 1e3
     found: dict[str, Figures] = {name: {} for name in tasks}
     order, shuffle, begin = list(tasks), random.Random(0), clock()
     for turn in range(pace.max_rounds):
-        spent = clock() - begin
-        if turn >= pace.min_rounds and spent + 0.5 * spent / turn > pace.seconds:
+        if turn >= pace.min_rounds and clock() - begin >= pace.seconds:
             break
         shuffle.shuffle(order)
-        for number, name in enumerate(order):
-            made = (turn + number / len(order)) / pace.max_rounds
-            over = (clock() - begin) / max(pace.seconds, 1e-9)
-            advance(min(1.0, max(made, over)), name)
+        for name in order:
+            advance(min(1.0, (clock() - begin) / max(pace.seconds, 1e-9)), name)
             pause(_PAUSE)
             if typical[name] < _SLOW:
                 tasks[name]()
-            count = max(1, min(_MAX_RUNS, round(_BURST / typical[name])))
-            runs = sorted((run(name) for _ in range(count)), key=lambda one: one[0])
-            for figure, value in runs[count // 2][1].items():
+            count = max(1, min(_MAX_RUNS, round(_BURST / max(typical[name], 1e-7))))
+            runs = sorted((run(name) for _ in range(count)), key=lambda figures: figures["ms"])
+            for figure, value in runs[count // 2].items():
                 found[name].setdefault(figure, []).append(value)
     return found
 
 
 def spread(values: Sequence[float]) -> dict[str, Any]:
-    """Median, quartiles (linear interpolation), extremes and number of `values`.
+    """Median, quartiles (linear interpolation) and number of `values`.
 
     Raises ValueError without values.
     """
     if not len(values):
         raise ValueError("no values to summarise")
-    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    return {
-        "median": significant(middle),
-        "quartiles": [significant(low), significant(high)],
-        "least": significant(min(values)),
-        "most": significant(max(values)),
-        "count": len(values),
-    }
+    low, middle, high = (significant(q) for q in np.quantile(values, [0.25, 0.5, 0.75]))
+    return {"median": middle, "quartiles": [low, high], "count": len(values)}
 
 
 def ratio(above: Sequence[float], below: Sequence[float]) -> dict[str, Any]:
@@ -104,9 +90,9 @@ def ratio(above: Sequence[float], below: Sequence[float]) -> dict[str, Any]:
 
     Raises ValueError without a round.
     """
-    return spread([a / b for a, b in zip(above, below, strict=False) if b > 0])
+    return spread([a / b for a, b in zip(above, below, strict=True)])
 
 
 def significant(value: float) -> float:
     """The value with six significant digits, for files that people read."""
-    return float(f"{float(value):.{_DIGITS}g}")
+    return float(f"{float(value):.6g}")

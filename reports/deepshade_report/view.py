@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +18,7 @@ from deepshade.camera import Camera
 from deepshade.effects import EFFECTS, SETTINGS, Effect
 from deepshade.errors import DataError
 from deepshade.files import sha256
-from deepshade.gbuffer import background
+from deepshade.gbuffer.background import remove
 from deepshade.manifest import Manifest, shard_path
 
 Float = NDArray[np.float32]
@@ -29,16 +29,14 @@ MEGAPIXELS = WIDTH * HEIGHT / 1e6
 _MAX_HALF = 65504.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
     """One picture's attributes and the reference of one effect.
 
     `attributes` are (C, H, W) by name, camera space and scene units, zero where `background`
     (H, W) is true, but for those that say something there. `reference` is (C', H, W). `radius` is
-    the effect's, in scene units; `fov` the full horizontal angle of the frame that the view shows
-    or is a window of, in degrees. `pixels_per_unit` are the pixels that a length of 1 spans at
-    distance 1, and `axis` is the pixel (column, row) that the optical axis meets: None means that
-    the view is the frame. `record` is what the data set's manifest keeps to render it again.
+    the effect's, in scene units. The `camera` may show more: the view is then a window of its
+    frame. `record` is what the data set's manifest keeps to render the view again.
     """
 
     scene: str
@@ -47,9 +45,7 @@ class View:
     background: NDArray[np.bool_]
     reference: Float
     radius: float
-    fov: float
-    pixels_per_unit: float | None = None
-    axis: tuple[float, float] | None = None
+    camera: Camera
     record: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -61,31 +57,6 @@ class View:
     def width(self) -> int:
         """Columns."""
         return int(self.background.shape[1])
-
-    def pixel_scale(self) -> float:
-        """Pixels that a horizontal length of 1 at distance 1 spans."""
-        if self.pixels_per_unit is not None:
-            return self.pixels_per_unit
-        return Camera(self.fov, self.width, self.height).pixels_per_unit
-
-    def optical_axis(self) -> tuple[float, float]:
-        """Column and row, in pixels from the top left corner, where the optical axis lies."""
-        return (self.width / 2, self.height / 2) if self.axis is None else self.axis
-
-    def camera(self) -> Camera:
-        """The camera that the view was rendered with, with its place in the world.
-
-        Raises DataError when the view's record holds none.
-        """
-        try:
-            known = self.record["camera"]
-            (width, height), (x0, y0) = known["frame"], known["origin"]
-            return Camera(known["fov"], width, height, known["world_to_camera"], x0, y0)
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(
-                f"the view of {self.scene} has no camera: {error}",
-                fix="use a data set that 'deepshade datagen' wrote",
-            ) from error
 
     def trivial(self) -> Float:
         """(C', H, W): the answer of doing nothing."""
@@ -116,25 +87,21 @@ def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View
     Raises DataError: `folder` holds no such data set, a shard is damaged, or no view shows enough.
     """
     row, manifest = EFFECTS[effect], Manifest.read(folder)
-    reference = f"reference_{effect}"
-    if missing := {*row.inputs, reference} - set(manifest.schema):
+    if missing := {*row.inputs, f"reference_{effect}"} - set(manifest.schema):
         raise DataError(
             f"{folder} has no {', '.join(sorted(missing))}",
             fix=f"render it with --effects {effect}",
         )
-    names = [name for name in manifest.schema if name in ATTRIBUTES] + [reference]
+    names = [name for name in manifest.schema if name in ATTRIBUTES] + [f"reference_{effect}"]
     found: list[View] = []
     for shard in manifest.shards:
         path = shard_path(folder, shard)
-        if not path.is_file():
-            raise DataError(f"{path} is named by the manifest but missing")
-        if sha256(path) != shard.sha256:
+        if not path.is_file() or sha256(path) != shard.sha256:
             raise DataError(
                 f"{path} is not the file that the manifest describes",
-                fix="run the same 'deepshade datagen' again: it renders what is damaged",
+                fix="run the same 'deepshade datagen' again: it renders what is missing or damaged",
             )
-        for record, planes in zip(shard.samples, _samples(path, names), strict=False):
-            view = _view(row, record, planes, planes.pop(reference))
+        for view in _read(path, shard.samples, row, names):
             if view.contrast() >= row.min_contrast:
                 found.append(view)
             if len(found) == limit:
@@ -147,34 +114,25 @@ def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View
     return found
 
 
-def _samples(path: Path, names: Sequence[str]) -> Any:
+def _read(
+    path: Path, records: Sequence[Mapping[str, Any]], effect: Effect, names: Sequence[str]
+) -> Iterator[View]:
     from safetensors import safe_open
 
     try:
         with safe_open(path, framework="numpy") as file:
-            planes = {name: file.get_slice(name) for name in names}
-            for index in range(planes[names[0]].get_shape()[0]):
-                yield {name: plane[index].astype(np.float32) for name, plane in planes.items()}
-    except (OSError, ValueError, KeyError, IndexError) as error:
-        raise DataError(f"{path} can't be read: {error}") from error
-
-
-def _view(row: Effect, record: Mapping[str, Any], planes: dict[str, Float], answer: Float) -> View:
-    empty, _ = background.remove(planes, list(planes))
-    known = record["camera"]
-    (width, height), (x0, y0) = known["frame"], known["origin"]
-    return View(
-        scene=str(record["scene"]),
-        effect=row,
-        attributes=planes,
-        background=empty,
-        reference=answer,
-        radius=float(record.get("radius") or 1.0),
-        fov=float(known["fov"]),
-        pixels_per_unit=Camera(known["fov"], width, height).pixels_per_unit,
-        axis=(width / 2 - x0, height / 2 - y0),
-        record=record,
-    )
+            stored = {name: file.get_slice(name) for name in names}
+            for index, record in enumerate(records):
+                planes = {name: plane[index].astype(np.float32) for name, plane in stored.items()}
+                reference = planes.pop(f"reference_{effect.name}")
+                background, _ = remove(planes, list(planes))
+                known = record["camera"]
+                frame = known["fov"], *known["frame"], known["world_to_camera"], *known["origin"]
+                radius = float(record.get("radius") or 1.0)
+                scene, camera = str(record["scene"]), Camera(*frame)
+                yield View(scene, effect, planes, background, reference, radius, camera, record)
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise DataError(f"{path} can't be read: {error!r}") from error
 
 
 def fullest(views: Sequence[View]) -> View:
@@ -210,7 +168,7 @@ def body(view: View, height: int = HEIGHT, width: int = WIDTH, *, grain: bool = 
                 some = np.resize(noise, bits.shape)
                 np.bitwise_xor(bits, some, out=bits, where=(bits & 0x7FFF) > 4)
     # the angle that keeps the view's pixels per unit
-    fov = math.degrees(2 * math.atan(width / 2 / view.pixel_scale()))
+    fov = math.degrees(2 * math.atan(width / 2 / view.camera.pixels_per_unit))
     settings = {SETTINGS[name].header: view.record.get(name) for name in view.effect.settings}
     known = {name: value for name, value in settings.items() if value is not None}
     known |= {SETTINGS["radius"].header: view.radius, "deepshade:fov": fov}

@@ -18,7 +18,6 @@ def test_the_spread_is_that_of_the_standard_library(numbers: list[float]) -> Non
     low, middle, high = statistics.quantiles(numbers, n=4, method="inclusive")
     found = spread(numbers)
     assert [*found["quartiles"], found["median"]] == pytest.approx([low, high, middle], rel=6e-6)
-    assert found["least"] == pytest.approx(min(numbers), rel=6e-6)
 
 
 @given(st.lists(values, min_size=1, max_size=20), st.floats(0.5, 50))
@@ -26,7 +25,7 @@ def test_what_both_suffer_cancels_in_a_ratio(numbers: list[float], factor: float
     found = ratio([factor * value for value in numbers], numbers)
     assert found["median"] == pytest.approx(factor, rel=1e-5)
     with pytest.raises(ValueError, match="no values"):
-        ratio(numbers, [])
+        ratio([], [])
 
 
 class Clock:

@@ -68,7 +68,7 @@ def made(
         background,
         np.ones((1, *background.shape), np.float32),
         radius,
-        fov,
+        Camera(fov, background.shape[1], background.shape[0]),
     )
 
 

@@ -16,8 +16,9 @@ def folder(effect: str) -> ModuleType | None:
 
     Its METHODS map what a page calls them to modules, whose `methods(quick)` gives one Method for
     each setting (in a quick report, few). A Method that traces the scene itself, and so can't shade
-    a frame that was continued beyond the rendered one, has `needs_scene = True`. PUBLISHED are the
-    paper's own (milliseconds at 768 x 512, SSIM), if there.
+    a frame that was continued beyond the rendered one, has `needs_scene = True`. A module whose
+    method has parameters offers them to `tuning` as TUNABLE. PUBLISHED are the paper's own
+    (milliseconds at 768 x 512, SSIM), if there.
     """
     name = f"{__name__}.{effect}"
     return import_module(name) if find_spec(name) else None

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from deepshade.engines import REFERENCE
 from deepshade_report.method import NETWORK, PAPER, PAPER_NETWORK
 from deepshade_report.view import MEGAPIXELS
 
-Sections = dict[str, Any]
-Row = dict[str, Any]
+Sections = dict[str, Any]  # {"status": "done", "data": figures} or "skipped" with a "reason", each
 
 
 class Skipped(Exception):
@@ -27,9 +26,9 @@ class Point:
     family: str
     cost: float
     error: float
-    settings: dict[str, Any] = field(default_factory=dict)
-    quartiles: tuple[float, float] = (0.0, 0.0)
-    of_trivial: float = 0.0
+    settings: dict[str, Any]
+    quartiles: tuple[float, float] = (0.0, 0.0)  # of the milliseconds
+    of_trivial: float = 0.0  # the error as a share of the trivial answer's
 
     @property
     def milliseconds(self) -> float:
@@ -42,17 +41,14 @@ class Point:
         return f"{self.settings.get('engine')}/{self.settings.get('precision')}"
 
 
-def data(sections: Sections, name: str) -> dict[str, Any] | None:
-    """A section's figures, None if it wasn't measured."""
-    section = sections.get(name) or {}
-    found = section.get("data") if section.get("status") == "done" else None
-    return found if isinstance(found, dict) else None
+def data(sections: Sections, name: str) -> dict[str, Any]:
+    """A section's figures, empty if it wasn't measured."""
+    return sections.get(name, {}).get("data") or {}
 
 
-def rows(sections: Sections, section: str, /, **wanted: Any) -> list[Row]:
-    """A section's rows with these values; none if it wasn't measured."""
-    found = (data(sections, section) or {}).get("rows", [])
-    return [row for row in found if all(row.get(key) == value for key, value in wanted.items())]
+def rows(sections: Sections, name: str) -> list[dict[str, Any]]:
+    """A section's rows, none if it wasn't measured."""
+    return list(data(sections, name).get("rows", ()))
 
 
 def points(sections: Sections) -> list[Point]:
@@ -96,11 +92,10 @@ def standing_for(found: Sequence[Point]) -> dict[str, Point]:
     chosen: dict[str, Point] = {}
     for name in dict.fromkeys(point.name for point in found):
         own = [point for point in found if point.name == name]
-        exact = [point for point in own if point.backend == str(REFERENCE)]
         if own[0].family == NETWORK:
             chosen[name] = own[0]
-        elif own[0].family == PAPER_NETWORK and exact:
-            chosen[name] = exact[0]
+        elif own[0].family == PAPER_NETWORK:
+            chosen[name] = next((p for p in own if p.backend == str(REFERENCE)), own[0])
         else:
             chosen[name] = min(own, key=lambda point: point.error)
     return chosen
@@ -111,6 +106,12 @@ def title(name: str) -> str:
     return "the paper's network" if name == PAPER else name
 
 
+def _defaults(found: Sequence[Point]) -> list[Point]:
+    """The networks as they run by default, the fastest first."""
+    own = [p for p in standing_for(found).values() if p.family in (NETWORK, PAPER_NETWORK)]
+    return sorted(own, key=lambda point: point.cost)
+
+
 def summary(sections: Sections) -> list[dict[str, Any]]:
     """One line for each network as it runs by default, the fastest first.
 
@@ -118,26 +119,22 @@ def summary(sections: Sections) -> list[dict[str, Any]]:
     same precision: other ratios mix what the network and what the engine gains.
     """
     found = points(sections)
-    named = {p.name: p for p in standing_for(found).values() if p.family == NETWORK}
     paper = {point.backend: point for point in found if point.family == PAPER_NETWORK}
-    if paper:
-        named[PAPER] = standing_for(found)[PAPER]
     table = []
-    for name, point in named.items():
+    for point in _defaults(found):
         beside = paper.get(point.backend)
         table.append(
             {
-                "name": title(name),
+                "name": title(point.name),
                 "backend": point.backend,
                 "ms": point.milliseconds,
-                "ms_per_megapixel": point.cost,
                 "dssim": point.error,
                 "of_trivial": point.of_trivial,
                 "like_for_like": beside and beside.cost / point.cost,
                 "less_error": beside and 1 - point.error / beside.error,
             }
         )
-    return sorted(table, key=lambda row: float(row["ms"]))
+    return table
 
 
 def same_time(sections: Sections) -> list[dict[str, Any]]:
@@ -147,14 +144,11 @@ def same_time(sections: Sections) -> list[dict[str, Any]]:
     none does.
     """
     found = points(sections)
-    budgets = [p for p in standing_for(found).values() if p.family in (NETWORK, PAPER_NETWORK)]
     table = []
-    for budget in sorted(budgets, key=lambda point: point.cost):
-        reached: dict[str, Any] = {}
-        for name in dict.fromkeys(point.name for point in found):
-            # a budget is the median of one method, so it fits itself in spite of rounding
-            fit = [p for p in found if p.name == name and p.cost <= budget.cost * 1.001]
-            best = min(fit, key=lambda point: point.error, default=None)
-            reached[name] = best and {"id": best.id, "dssim": best.error, "ms": best.milliseconds}
+    for budget in _defaults(found):
+        fitting = [point for point in found if point.cost <= budget.cost]
+        reached: dict[str, Any] = dict.fromkeys(point.name for point in found)
+        for best in sorted(fitting, key=lambda point: -point.error):  # the least error comes last
+            reached[best.name] = {"id": best.id, "dssim": best.error, "ms": best.milliseconds}
         table.append({"budget": title(budget.name), "ms": budget.milliseconds, "reached": reached})
     return table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from statistics import fmean
 from typing import Any
 
@@ -16,13 +17,13 @@ from deepshade_report.view import HEIGHT, MEGAPIXELS, WIDTH, View, fullest, resi
 _SPEED_SECONDS = 100.0
 
 
-def methods(context: Context) -> tuple[list[Method], dict[str, str]]:
-    """All that this machine can compare, and what is missing with the reason."""
-    found: list[Method] = list(networks(context.served, context.paper_network, context.threads))
+def methods(context: Context) -> tuple[dict[str, Method], dict[str, str]]:
+    """All that this machine can compare, by identity, and what is missing with the reason."""
+    own = networks(context.served, context.paper_network, context.threads)
     others, missing = baselines(context.effect, context.quick)
     if context.paper_network is None:
         missing["the paper's network"] = "no bundle of it: name one with --paper"
-    return [*found, *others], missing
+    return {identity(method): method for method in (*own, *others)}, missing
 
 
 def error(context: Context) -> dict[str, Any]:
@@ -30,28 +31,23 @@ def error(context: Context) -> dict[str, Any]:
     views = context.views
     found, missing = methods(context)
     trivial = fmean(view.dssim(view.trivial()) for view in views)
-    errors: dict[str, list[float]] = {identity(method): [] for method in found}
+    errors: dict[str, list[float]] = {name: [] for name in found}
     for number, view in enumerate(views):  # outermost: what traces rays keeps a view's scene
-        for index, method in enumerate(found):
-            name = identity(method)
+        for index, (name, method) in enumerate(found.items()):
             if name in missing:
                 continue
             context.advance((number + index / len(found)) / len(views), f"{view.scene}: {name}")
             try:
                 method.prepare(view)
-                errors[name].append(view.dssim(shaded(method, view)))
+                errors[name].append(significant(view.dssim(shaded(method, view))))
             except DeepshadeError as problem:
                 missing[name] = str(problem)
-    rows = [
-        {
-            **about(method),
-            "dssim": significant(fmean(each)),
-            "of_trivial": significant(fmean(each) / trivial),
-            "each": [significant(value) for value in each],
-        }
-        for method in found
-        if len(each := errors[identity(method)]) == len(views)
-    ]
+    rows = []
+    for name, each in errors.items():
+        if name not in missing:
+            mean = fmean(each)
+            about = {"dssim": significant(mean), "of_trivial": significant(mean / trivial)}
+            rows.append({**facts(found[name]), **about, "each": each})
     return {
         "views": len(views),
         "scenes": sorted({view.scene for view in views}),
@@ -68,9 +64,8 @@ def speed(context: Context) -> dict[str, Any]:
     frame = resized(view)
     found, missing = methods(context)
     tasks: dict[str, Callable[[], object]] = {}
-    kept: dict[str, tuple[Method, float]] = {}
-    for method in found:
-        name = identity(method)
+    megapixels: dict[str, float] = {}
+    for name, method in found.items():
         # tracing rays needs the scene's own geometry, so a view as it was rendered
         shown = view if getattr(method, "needs_scene", False) else frame
         context.advance(0.0, f"preparing {name}")
@@ -80,20 +75,14 @@ def speed(context: Context) -> dict[str, Any]:
         except DeepshadeError as problem:
             missing[name] = str(problem)
             continue
-        tasks[name] = _bound(method, shown)
-        kept[name] = method, shown.background.size / 1e6
+        tasks[name] = partial(method.shade, shown)
+        megapixels[name] = shown.background.size / 1e6
     times = alternate(tasks, context.pace(_SPEED_SECONDS), advance=context.advance)
     rows = []
-    for name, (method, megapixels) in kept.items():
-        ms = [value * MEGAPIXELS / megapixels for value in times[name]["ms"]]
-        rows.append(
-            {
-                **about(method),
-                "ms": spread(ms),
-                "ms_per_megapixel": significant(spread(ms)["median"] / MEGAPIXELS),
-                "measured_megapixels": significant(megapixels),
-            }
-        )
+    for name, figures in times.items():
+        ms = spread([value * MEGAPIXELS / megapixels[name] for value in figures["ms"]])
+        per_megapixel = significant(ms["median"] / MEGAPIXELS)
+        rows.append({**facts(found[name]), "ms": ms, "ms_per_megapixel": per_megapixel})
     return {
         "frame": [WIDTH, HEIGHT],
         "background": significant(frame.background.mean()),
@@ -107,12 +96,8 @@ def shaded(method: Method, view: View) -> Any:
     return method.shade(view).reshape(view.reference.shape)
 
 
-def about(method: Method) -> dict[str, Any]:
-    """Who a row is about."""
+def facts(method: Method) -> dict[str, Any]:
+    """Which method a row is about."""
     row: dict[str, Any] = {"id": identity(method), "name": method.name, "family": method.family}
-    row["settings"] = dict(method.settings)
+    row["settings"] = method.settings
     return row | ({"sha256": method.bundle.sha256} if isinstance(method, Network) else {})
-
-
-def _bound(method: Method, view: View) -> Callable[[], object]:
-    return lambda: method.shade(view)

@@ -8,94 +8,63 @@ by marching, then in closed form for the normal projected into the slice (the me
 
     1/4 Σ (cos γ + 2 h sin γ - cos(2 h - γ)) · |projected normal|
 
-with the horizon angles h from the eye's ray and the projected normal's angle γ. The falloff, the
-spread of samples and the thin-occluder compensation are those of Intel's XeGTAO 1.30 (F. Strugar
-and S. McCalla, 2021); the thickness heuristic is the memo's (its section on thickness).
+with the horizon angles h from the eye's ray and the projected normal's angle γ. The falloff and the
+spread of samples are those of Intel's XeGTAO 1.30 (F. Strugar and S. McCalla, 2021). The memo's
+thickness heuristic and XeGTAO's thin-occluder compensation are left out: a search over both, 161
+trials, found the least error without them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
 
 from deepshade_report.baselines.ao.screen import (
+    RANGES,
     TINY,
     Marching,
+    Parameters,
     Screen,
     mi,
-    opaque,
     plane,
     sample,
     start,
     stride,
-    tuned,
 )
-from deepshade_report.method import Method
+from deepshade_report.tuning import Tunable, tuned
 
 # slices and steps to each side, from cheap to best
 SETTINGS = ((1, 2), (2, 2), (2, 4), (3, 6), (6, 8), (9, 12))
 QUICK = ((2, 4), (6, 8))
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """What can be tuned.
-
-    `radius` multiplies the effect's, and `falloff` in (0, 1] is the share of it over which
-    samples lose their weight, up to the radius (XeGTAO's RadiusMultiplier and
-    EffectFalloffRange). `bias` is how far, in sines, a sample must rise over the tangent.
-    `thickness` in [0, 1] lets the horizon sink towards later samples that lie lower, as if
-    occluders were thin. `thin` stretches depth in the falloff (ThinOccluderCompensation).
-    Occlusion is multiplied by `intensity`, what is left open is raised to `power`
-    (FinalValuePower). `spread` draws samples towards the pixel (SampleDistributionPower). `blur`
-    is the filter's half width in pixels (0 = none), `edge` the depth step, in radii, that stops
-    it.
-    """
-
-    radius: float = 1.457
-    falloff: float = 0.615
-    bias: float = 0.0
-    thickness: float = 0.0
-    thin: float = 0.0
-    intensity: float = 1.0
-    power: float = 1.0
-    spread: float = 2.0
-    blur: int = 2
-    edge: float = 0.2
+# XeGTAO's RadiusMultiplier, EffectFalloffRange and SampleDistributionPower
+PUBLISHED = Parameters(radius=1.457, falloff=0.615, bias=0.0, spread=2.0, blur=2)
 
 
-class GTAO(Marching):
-    """GTAO as a Method."""
-
-    name = "GTAO"
-
-    def __init__(self, count: int, steps: int, parameters: Parameters | None = None) -> None:
-        settings = {"slices": count, "steps": steps}
-        super().__init__(settings, parameters or Parameters(**tuned("gtao")))
-
-    def march(self, screen: Screen) -> Any:
-        """See `Marching.march`."""
-        p, (count, steps) = self.parameters, self.counts
-        counts = [dr.opaque(mi.UInt32, value) for value in (count, steps)]
-        given = p.radius, p.falloff, p.bias, p.thickness, p.thin, p.spread, p.intensity, p.power
-        return _march(screen, *counts, *opaque(*given))
+def gtao(slices: int, steps: int, parameters: Parameters | None = None) -> Marching:
+    """GTAO as a Method, with the parameters that were tuned or those given."""
+    settings = {"slices": slices, "steps": steps}
+    parameters = parameters or Parameters(**tuned(__package__, "gtao"))
+    return Marching("GTAO", settings, parameters, _march)
 
 
-def methods(quick: bool) -> Sequence[Method]:
+TUNABLE = Tunable(partial(gtao, 3, 6), PUBLISHED, RANGES)
+
+
+def methods(quick: bool) -> list[Marching]:
     """GTAO at its settings, from cheap to best; in a quick report, two of them."""
-    return [GTAO(count, steps) for count, steps in (QUICK if quick else SETTINGS)]
+    return [gtao(slices, steps) for slices, steps in (QUICK if quick else SETTINGS)]
 
 
 @dr.syntax
 def _march(screen: Screen, slices: Any, steps: Any, *given: Any) -> Any:
-    radius, falloff, bias, thickness, thin, spread, intensity, power = given
+    radius, falloff, bias, spread, intensity, power = given
     column, row = screen.pixels()
     here, eye, facing, reach, active = start(screen, column, row)
     fade = -1 / (radius * falloff)
-    stretch = dr.square(1 + thin) - 1
     total = mi.Float(0)
     index = mi.UInt32(0)
     while (index < slices) & active:
@@ -106,15 +75,14 @@ def _march(screen: Screen, slices: Any, steps: Any, *given: Any) -> Any:
             right, down = stride(screen, reach * radius, spread, index, step, steps, cos, sin)
             seen = []
             for side, low in ((1, -tilt), (-1, tilt)):  # unrolled
-                elevation, squared, deep = sample(screen, here, eye, column, row, right, down, side)
-                far = dr.sqrt(dr.fma(dr.square(deep), stretch, squared))
-                weight = dr.clip(dr.fma(far, fade, 1 / falloff), 0, 1)
+                elevation, squared = sample(screen, here, eye, column, row, right, down, side)
+                weight = dr.clip(dr.fma(dr.sqrt(squared), fade, 1 / falloff), 0, 1)
                 seen.append(dr.lerp(low, elevation - bias, weight))
-            first = _raised(first, seen[0], thickness)
-            second = _raised(second, seen[1], thickness)
+            first = dr.maximum(first, seen[0])
+            second = dr.maximum(second, seen[1])
             step += 1
-        h0 = dr.acos(dr.clip(dr.maximum(first, -tilt), -1, 1))
-        h1 = -dr.acos(dr.clip(dr.maximum(second, tilt), -1, 1))
+        h0 = dr.acos(dr.clip(first, -1, 1))
+        h1 = -dr.acos(dr.clip(second, -1, 1))
         cosine = facing / dr.maximum(length, TINY)
         angle = dr.safe_acos(cosine)
         lean = dr.select(tilt < 0, -angle, angle)
@@ -123,8 +91,3 @@ def _march(screen: Screen, slices: Any, steps: Any, *given: Any) -> Any:
         index += 1
     visible = dr.clip(1 + (total / mi.Float(slices) - 1) * intensity, 0, 1)
     return dr.select(active, dr.power(visible, power), 1)
-
-
-def _raised(horizon: Any, seen: Any, thickness: Any) -> Any:
-    """The horizon after a sample; it sinks towards lower ones as if occluders were thin."""
-    return dr.select(seen >= horizon, seen, dr.lerp(horizon, seen, thickness))

@@ -13,77 +13,52 @@ come in opposite pairs, turned by a per-pixel jitter, and a depth-aware blur tak
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
 
 from deepshade_report.baselines.ao.screen import (
+    RANGES,
     Marching,
+    Parameters,
     Screen,
     mi,
-    opaque,
     plane,
     sample,
     start,
     stride,
-    tuned,
 )
-from deepshade_report.method import Method
+from deepshade_report.tuning import Tunable, tuned
 
 # directions and steps a direction, from cheap to best
 SETTINGS = ((4, 2), (4, 4), (8, 4), (8, 8), (16, 8))
 QUICK = ((4, 4), (8, 8))
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """What can be tuned.
-
-    `radius` multiplies the effect's. `falloff` in (0, 1] is the share of the squared radius over
-    which attenuation fades to zero: 1 is W = 1 - (r / R)², as published; less keeps far occluders
-    whole. `bias` is the angle over the tangent, in radians, below which nothing occludes.
-    Occlusion is multiplied by `intensity`, what is left open is raised to `power`. `blur` is the
-    filter's half width in pixels (0 = none), `edge` the depth step, in radii, that stops it.
-    `spread` is the power that draws samples towards the pixel.
-    """
-
-    radius: float = 1.0
-    falloff: float = 1.0
-    bias: float = 0.1
-    intensity: float = 1.0
-    power: float = 1.0
-    spread: float = 1.0
-    blur: int = 3
-    edge: float = 0.2
+# W = 1 - (r / R)²
+PUBLISHED = Parameters(radius=1.0, falloff=1.0, bias=0.1, spread=1.0)
 
 
-class HBAO(Marching):
-    """HBAO as a Method."""
-
-    name = "HBAO"
-
-    def __init__(self, directions: int, steps: int, parameters: Parameters | None = None) -> None:
-        settings = {"directions": directions, "steps": steps}
-        super().__init__(settings, parameters or Parameters(**tuned("hbao")))
-
-    def march(self, screen: Screen) -> Any:
-        """See `Marching.march`."""
-        p, (directions, steps) = self.parameters, self.counts
-        counts = [dr.opaque(mi.UInt32, value) for value in (max(directions // 2, 1), steps)]
-        given = p.radius, p.falloff, p.bias, p.spread, p.intensity, p.power
-        return _march(screen, *counts, *opaque(*given))
+def hbao(directions: int, steps: int, parameters: Parameters | None = None) -> Marching:
+    """HBAO as a Method, with the parameters that were tuned or those given."""
+    settings = {"directions": directions, "steps": steps}
+    parameters = parameters or Parameters(**tuned(__package__, "hbao"))
+    return Marching("HBAO", settings, parameters, _march)
 
 
-def methods(quick: bool) -> Sequence[Method]:
+TUNABLE = Tunable(partial(hbao, 8, 4), PUBLISHED, RANGES)
+
+
+def methods(quick: bool) -> list[Marching]:
     """HBAO at its settings, from cheap to best; in a quick report, two of them."""
-    return [HBAO(directions, steps) for directions, steps in (QUICK if quick else SETTINGS)]
+    return [hbao(directions, steps) for directions, steps in (QUICK if quick else SETTINGS)]
 
 
 @dr.syntax
-def _march(screen: Screen, pairs: Any, steps: Any, *given: Any) -> Any:
+def _march(screen: Screen, directions: Any, steps: Any, *given: Any) -> Any:
     radius, falloff, bias, spread, intensity, power = given
+    pairs = dr.maximum(directions // 2, 1)
     column, row = screen.pixels()
     here, eye, facing, reach, active = start(screen, column, row)
     slope = -1 / (dr.square(radius) * falloff)
@@ -97,7 +72,7 @@ def _march(screen: Screen, pairs: Any, steps: Any, *given: Any) -> Any:
             right, down = stride(screen, reach * radius, spread, index, step, steps, cos, sin)
             rises = []
             for side, horizon in ((1, first), (-1, second)):  # unrolled
-                elevation, squared, _ = sample(screen, here, eye, column, row, right, down, side)
+                elevation, squared = sample(screen, here, eye, column, row, right, down, side)
                 weight = dr.clip(dr.fma(squared, slope, 1 / falloff), 0, 1)
                 rise = dr.select(weight > 0, dr.maximum(elevation - horizon, 0), 0)
                 total = dr.fma(weight, rise, total)

@@ -7,20 +7,18 @@ G-buffer is given, as it is to every method, so primary hits aren't part of what
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
 import mitsuba_oidn as oidn
 import numpy as np
 
-from deepshade.errors import DataError, SceneError
-from deepshade_report.method import Method
+from deepshade.errors import DataError
 from deepshade_report.view import Float, View
 from deepshade_workers.backend import mitsuba
 from deepshade_workers.sampling import pixel_streams, random_pair, strata
-from deepshade_workers.scenes.loading import PROCEDURAL, open_scene
+from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, offset_origin, trace
 
@@ -35,10 +33,6 @@ _OTHER_SEED = 0x9E3779B97F4A7C15
 # How far a depth may be from the stored one, relatively, and how many pixels may be farther.
 _SAME_DEPTH = 1e-3
 _MAX_DIFFERENT = 0.01
-
-
-# The view that was rebuilt last: several methods shade each in turn.
-_kept: tuple[View, Scene, Hits] | None = None
 
 
 @dr.syntax
@@ -72,18 +66,16 @@ def visibility(scene: Scene, hits: Hits, *, radius: float, rays: int, seed: int)
     return np.asarray(shares.numpy(), np.float32).reshape(hits.height, hits.width)
 
 
+@lru_cache(maxsize=1)  # several methods shade each view in turn
 def rebuild(view: View) -> tuple[Scene, Hits]:
     """The scene that a view was rendered from, and what its pixels' centres see.
 
     Raises:
-        DataError: the view names no scene or camera, or the scene is no longer what it was.
+        DataError: the scene is no longer what it was.
         SceneError: there is no such scene.
     """
-    global _kept
-    if _kept is not None and _kept[0] is view:
-        return _kept[1:]
-    scene = open_scene(find_scene(view.scene))
-    hits = trace(scene, view.camera(), view.width, view.height)
+    scene = open_scene(view.scene)
+    hits = trace(scene, view.camera, view.width, view.height)
     valid = hits.valid.numpy().reshape(view.height, view.width)
     depth = hits.depth.numpy().reshape(view.height, view.width)
     stored = -view.attributes["position"][2]
@@ -94,69 +86,28 @@ def rebuild(view: View) -> tuple[Scene, Hits]:
             f"{1 - same.mean():.0%} of the view's pixels see another surface in {view.scene}",
             fix="use the scene file that the data set was rendered from",
         )
-    _kept = view, scene, hits
     return scene, hits
 
 
-def find_scene(name: str) -> str:
-    """Where the scene of a record is: as it's named, or so below this folder or one around it.
+def denoise(noisy: Float, normal: Float, quality: str) -> Float:
+    """(H, W) without the noise, by Open Image Denoise; may leave [0, 1] by a little.
 
-    Data sets name files relative to where they were made, maybe in a folder beside that: of
-    ../shared/scenes/a.obj, shared/scenes/a.obj is looked for here and in all folders above.
-
-    Raises SceneError when it is nowhere.
+    `normal` is (H, W, 3), unit, zero in background. The noise of a few rays a pixel is clipped to
+    [0, 1], and the filter's mode for pictures of low dynamic range takes it for that of a brighter,
+    clipped signal: at 4 rays a pixel its answer is .03 to .05 too bright on average. Its mode for
+    high dynamic range keeps the mean, so that one runs, with a scale of 1 rather than one guessed
+    from the picture.
     """
-    if name.split(":")[0] == PROCEDURAL or Path(name).is_file():
-        return name
-    inner = Path(*(part for part in Path(name).parts if part not in ("..", "/")))
-    here = Path.cwd()
-    for folder in (here, *here.parents):
-        if (folder / inner).is_file():
-            return str(folder / inner)
-    raise SceneError(
-        f"the scene {name} isn't here",
-        fix="run this in the folder that the data set was rendered in",
+    clean = oidn.denoise(
+        noisy,
+        albedo=np.ones_like(normal),  # the filter wants one with every normal
+        normal=normal,
+        hdr=True,
+        input_scale=1.0,
+        clean_aux=True,  # primary hits through pixel centres have no noise
+        quality=_QUALITIES[quality],
     )
-
-
-class Denoiser:
-    """The library's RT filter at "fast" or "high" quality, for one channel in [0, 1].
-
-    The noise of a few rays a pixel is clipped to [0, 1], and the filter's mode for pictures of
-    low dynamic range takes it for that of a brighter, clipped signal: at 4 rays a pixel its answer
-    is .03 to .05 too bright on average. Its mode for high dynamic range keeps the mean, so that
-    one runs, with a scale of 1 rather than one guessed from the picture.
-    """
-
-    def __init__(self, quality: str) -> None:
-        self.quality = quality
-        self._shape = (0, 0)
-        self._normal = self._albedo = np.empty((0, 0, 3), np.float32)
-
-    def prepare(self, normal: Float) -> None:
-        """Take the (3, H, W) unit normals, zero in background, and build the filter.
-
-        The filter wants an albedo with every normal: occlusion has none, so it's white.
-        """
-        self._normal = np.ascontiguousarray(normal.transpose(1, 2, 0), np.float32)
-        self._albedo = np.ones_like(self._normal)
-        shape = (normal.shape[1], normal.shape[2])
-        if shape != self._shape:
-            self._shape = shape
-            self.denoise(np.ones(shape, np.float32))
-
-    def denoise(self, noisy: Float) -> Float:
-        """(H, W) without the noise; may leave [0, 1] by a little."""
-        clean = oidn.denoise(
-            noisy,
-            albedo=self._albedo,
-            normal=self._normal,
-            hdr=True,
-            input_scale=1.0,
-            clean_aux=True,  # primary hits through pixel centres have no noise
-            quality=_QUALITIES[self.quality],
-        )
-        return np.asarray(clean, np.float32)
+    return np.asarray(clean, np.float32)
 
 
 class RayTracing:
@@ -166,35 +117,31 @@ class RayTracing:
     needs_scene = True
 
     def __init__(self, rays: int, quality: str | None = None) -> None:
-        self.rays = rays
+        self.rays, self.quality = rays, quality
         self.name = "Mitsuba + OIDN" if quality else "Mitsuba"
         self.settings: dict[str, Any] = {"spp": rays} | ({"quality": quality} if quality else {})
-        self._denoiser = Denoiser(quality) if quality else None
-        self._ready: tuple[View, Scene, Hits] | None = None
+        self._normal = np.empty((0, 0, 3), np.float32)
 
     def prepare(self, view: View) -> None:
-        """Rebuild the scene, find the primary hits, compile the kernel, build the filter.
+        """Rebuild the scene and find the primary hits.
 
         Raises DataError or SceneError where the view's scene isn't to be had.
         """
-        scene, hits = rebuild(view)
-        self._ready = view, scene, hits
-        visibility(scene, hits, radius=view.radius, rays=1, seed=0)
-        if self._denoiser:
-            self._denoiser.prepare(view.attributes["normal"])
+        rebuild(view)
+        self._normal = np.ascontiguousarray(view.attributes["normal"].transpose(1, 2, 0))
 
     def shade(self, view: View) -> Float:
         """(H, W) in [0, 1] of the prepared view."""
-        if self._ready is None or self._ready[0] is not view:
-            self.prepare(view)
-        assert self._ready is not None
-        _, scene, hits = self._ready
+        scene, hits = rebuild(view)
         seed = (int(view.record.get("seed", 0)) + _OTHER_SEED) % 2**64
         image = visibility(scene, hits, radius=view.radius, rays=self.rays, seed=seed)
-        return np.clip(self._denoiser.denoise(image), 0, 1) if self._denoiser else image
+        if self.quality is None:
+            return image
+        clean: Float = np.clip(denoise(image, self._normal, self.quality), 0, 1)
+        return clean
 
 
-def methods(quick: bool) -> Sequence[Method]:
+def methods(quick: bool) -> list[RayTracing]:
     """Every number of rays, without a denoiser and with it; in a quick report, few.
 
     Of the denoiser's qualities the quickest and the best: the third lies between them.

@@ -10,18 +10,16 @@ function, so that every setting shares it. All lengths are in units of the effec
 
 from __future__ import annotations
 
-import json
 import math
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from importlib.resources import files
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade.errors import DeepshadeError
+from deepshade_report.tuning import Ranges
 from deepshade_report.view import Float, View
 from deepshade_workers.backend import mitsuba
 
@@ -30,6 +28,40 @@ mi = mitsuba()
 NEAREST = 1.3  # pixels between a pixel and its first sample, so that it never meets itself
 GOLDEN = 0.61803398875
 TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What can be tuned.
+
+    `radius` multiplies the effect's. `falloff` in (0, 1] is the share of it over which samples
+    lose their weight, up to the radius (HBAO: of its square). `bias` is how far over the tangent a
+    sample must rise (HBAO: in radians, GTAO: in sines). `spread` is the power that draws samples
+    towards the pixel. Occlusion is multiplied by `intensity`, what is left open is raised to
+    `power`. `blur` is the filter's half width in pixels (0 = none), `edge` the depth step, in
+    radii, that stops it.
+    """
+
+    radius: float
+    falloff: float
+    bias: float
+    spread: float
+    intensity: float = 1.0
+    power: float = 1.0
+    blur: int = 3
+    edge: float = 0.2
+
+
+RANGES: Ranges = {
+    "radius": (0.4, 2.5),
+    "falloff": (0.05, 1.0),
+    "bias": (0.0, 0.6),
+    "spread": (1.0, 2.5),
+    "intensity": (0.5, 2.5),
+    "power": (0.4, 2.5),
+    "blur": (0, 6),
+    "edge": (0.02, 0.5),
+}
 
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
@@ -81,7 +113,8 @@ def open_screen(view: View) -> Screen:
     row, column = np.divmod(np.arange(height * width), max(width, 1))
     turn, offset = jitter(column, row)
     planes = [np.where(there, plane, np.float32(0)).ravel() for plane in normal]
-    x, y = view.optical_axis()
+    camera = view.camera
+    x, y = camera.width / 2 - camera.x0, camera.height / 2 - camera.y0
     screen = Screen(
         (height, width),
         dr.opaque(mi.Int32, width),
@@ -90,7 +123,7 @@ def open_screen(view: View) -> Screen:
         dr.normalize(mi.Vector3f(*(mi.Float(plane) for plane in planes))),
         mi.Float(turn),
         mi.Float(offset),
-        dr.opaque(mi.Float, view.pixel_scale()),
+        dr.opaque(mi.Float, camera.pixels_per_unit),
         mi.Point2f(dr.opaque(mi.Float, x), dr.opaque(mi.Float, y)),
     )
     dr.eval(screen.normal)
@@ -108,16 +141,24 @@ def jitter(column: NDArray[np.int64], row: NDArray[np.int64]) -> tuple[Float, Fl
     return turn.astype(np.float32), step.astype(np.float32)
 
 
-class Marching(ABC):
-    """A screen-space Method with a number of directions, steps in each, and parameters."""
+class Marching:
+    """A screen-space Method.
+
+    `settings` are how many directions or slices, and how many steps in each. The `kernel` gives
+    every pixel's occlusion of a Screen, these counts and all parameters but the filter's two.
+    """
 
     family = "screen-space"
-    name: str
 
-    def __init__(self, settings: dict[str, int], parameters: Any) -> None:
-        self.settings: dict[str, Any] = dict(settings)
-        self.counts = tuple(settings.values())
-        self.parameters = parameters
+    def __init__(
+        self,
+        name: str,
+        settings: dict[str, Any],
+        parameters: Parameters,
+        kernel: Callable[..., Any],
+    ) -> None:
+        self.name, self.settings = name, settings
+        self.parameters, self.kernel = parameters, kernel
         self._screen: Screen | None = None
 
     def prepare(self, view: View) -> None:
@@ -126,36 +167,11 @@ class Marching(ABC):
 
     def shade(self, view: View) -> Float:
         """(H, W) in [0, 1], 1 = open, of the prepared view."""
-        if self._screen is None:
-            self.prepare(view)
         assert self._screen is not None
-        image = self.march(self._screen)
-        return finish(self._screen, image, self.parameters.blur, self.parameters.edge)
-
-    @abstractmethod
-    def march(self, screen: Screen) -> Any:
-        """Every pixel's ambient occlusion, not yet filtered."""
-
-
-def opaque(*values: float) -> list[Any]:
-    """Numbers as arguments of a compiled function."""
-    return [dr.opaque(mi.Float, float(value)) for value in values]
-
-
-def tuned(method: str) -> dict[str, Any]:
-    """The parameters of "hbao" or "gtao" that `tuning` found, by name.
-
-    Raises DeepshadeError for a damaged file.
-    """
-    source = files(__package__) / "tuned.json"
-    try:
-        found: dict[str, Any] = json.loads(source.read_text("utf-8"))[method]["parameters"]
-        return dict(found)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DeepshadeError(
-            f"{source} is damaged: {error!r}",
-            fix="tune again: python -m deepshade_report.baselines.ao.tuning --help",
-        ) from error
+        *given, blur, edge = astuple(self.parameters)
+        counts = [dr.opaque(mi.UInt32, count) for count in self.settings.values()]
+        numbers = [dr.opaque(mi.Float, float(value)) for value in given]
+        return finish(self._screen, self.kernel(self._screen, *counts, *numbers), blur, edge)
 
 
 def start(screen: Screen, column: Any, row: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -193,15 +209,15 @@ def stride(
 
 def sample(
     screen: Screen, here: Any, eye: Any, column: Any, row: Any, right: Any, down: Any, side: int
-) -> tuple[Any, Any, Any]:
-    """A sample's elevation (sine), squared distance and difference in z; far off for nothing."""
+) -> tuple[Any, Any]:
+    """A sample's elevation (sine) and squared distance; far off for nothing."""
     c = mi.Int32(dr.round(mi.Float(column) + side * right))
     r = mi.Int32(dr.round(mi.Float(row) + side * down))
     depth, inside = screen.look(screen.depth, c, r)
     delta = screen.position(c, r, depth) - here
     squared = dr.squared_norm(delta)
     elevation = dr.dot(delta, eye) * dr.rsqrt(dr.maximum(squared, TINY))
-    return elevation, dr.select(inside & (depth > 0), squared, 1e18), delta.z
+    return elevation, dr.select(inside & (depth > 0), squared, 1e18)
 
 
 def finish(screen: Screen, image: Any, blur: int, edge: float) -> Float:
