@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +168,7 @@ def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any])
             raise BundleError(
                 f"{where}: unknown entry '{key}'", fix=f"did you mean '{near}'?" if near else ""
             )
-    for key in _REQUIRED:
+    for key in (f.name for f in known.values() if f.default is f.default_factory is MISSING):
         if key not in config:
             near = nearest(key, config)
             hint = f"; is it '{near}'?" if near and near not in known else ""
@@ -238,17 +238,6 @@ def _hashes(value: Any) -> bool:
     )
 
 
-_REQUIRED = (
-    "effect",
-    "name",
-    "inputs",
-    "outputs",
-    "radius",
-    "fov",
-    "size_multiple",
-    "halo",
-    "bytes_per_pixel",
-)
 _CHECKS: dict[str, tuple[Any, str]] = {
     "effect": (lambda v: isinstance(v, str) and v in EFFECTS, f"one of {', '.join(EFFECTS)}"),
     "name": (_label, "a short name of letters, digits, '.', '_' and '-'"),

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade import exr, metrics
+from deepshade import exr, judging, metrics
 from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS, SETTINGS, Effect
@@ -60,15 +60,11 @@ class View:
 
     def trivial(self) -> Float:
         """(C', H, W): the answer of doing nothing."""
-        known = self.effect.trivial
-        answer = self.attributes[known] if isinstance(known, str) else np.float32(known)
-        return np.ascontiguousarray(np.broadcast_to(answer, self.reference.shape))
+        return judging.trivial(self.effect, self.attributes, self.reference)
 
     def exposed(self, image: Float) -> Float:
-        """(C', H, W) in [0, 1]: light times the factor that exposes the reference, clipped."""
-        factor = metrics.exposure(self.reference) if self.effect.is_light else 1.0
-        shown: Float = np.clip(np.asarray(image, np.float32) * np.float32(factor), 0, 1)
-        return shown
+        """(C', H, W) in [0, 1]: an answer exposed as the reference is."""
+        return judging.exposed(self.effect, self.reference, np.asarray(image))[0]
 
     def dssim(self, image: Float) -> float:
         """DSSIM of an answer (C', H, W), exposed as the reference is."""
@@ -76,9 +72,7 @@ class View:
 
     def contrast(self) -> float:
         """What the effect's row compares with `min_contrast`."""
-        if self.effect.contrast == "deviation":
-            return float(self.exposed(self.reference).std())
-        return self.dssim(self.trivial())
+        return judging.contrast(self.effect, self.reference, self.trivial())
 
 
 def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import signal
 import socket
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -14,14 +13,7 @@ if TYPE_CHECKING:
     from deepshade_service.config import Settings
 
 
-class LogLevel(StrEnum):
-    """What `--log-level` may be."""
-
-    critical = "critical"
-    error = "error"
-    warning = "warning"
-    info = "info"
-    debug = "debug"
+LogLevel = Literal["critical", "error", "warning", "info", "debug"]
 
 
 def serve(
@@ -66,7 +58,7 @@ def serve(
     grace: Annotated[float, typer.Option(help="Seconds to finish work at the end.")] = 20.0,
     log_level: Annotated[
         LogLevel, typer.Option(case_sensitive=False, help="The least that is logged.")
-    ] = LogLevel.info,
+    ] = "info",
 ) -> None:
     """Serve the shaders over HTTP."""
     from dataclasses import replace

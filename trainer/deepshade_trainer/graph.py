@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 MIN_AFTER = 2  # convolutions that stay in float on the way to the picture
 CONVOLUTIONS = {"Conv", "ConvTranspose", "MatMul", "Gemm"}
 # What of ONNX Runtime's basic passes would join weights to their neighbours, or rename them.
-_FUSIONS = [
-    "ConvAddFusion",
-    "ConvMulFusion",
-    "ConvBNFusion",
-    "ConvActivationFusion",
-    "MatMulAddFusion",
-    "ReluClipFusion",
-    "PadFusion",
-]
+_FUSIONS = ["ConvAdd", "ConvMul", "ConvBN", "ConvActivation", "MatMulAdd", "ReluClip", "Pad"]
 
 
 def fold_constants(path: Path, target: Path) -> Any:
@@ -38,7 +30,10 @@ def fold_constants(path: Path, target: Path) -> Any:
     options.optimized_model_filepath = str(target)
     options.log_severity_level = 3
     ort.InferenceSession(
-        str(path), options, providers=["CPUExecutionProvider"], disabled_optimizers=_FUSIONS
+        str(path),
+        options,
+        providers=["CPUExecutionProvider"],
+        disabled_optimizers=_FUSIONS,
     )
     model = onnx.load(str(target))
     plain = [entry for entry in model.opset_import if entry.domain == ""]

@@ -30,7 +30,7 @@ def comparison(context: Context) -> dict[str, Any]:
     if not chosen:
         raise Skipped("it needs the sections error and speed")
     views = [view for view in context.views if view.background.mean() <= _MAX_BACKGROUND]
-    views = sorted(views or context.views, key=lambda view: view.contrast())
+    views = sorted(views or context.views, key=View.contrast)
     view = views[len(views) // 2]
     found, _ = methods(context)
     panels: list[dict[str, Any]] = []
