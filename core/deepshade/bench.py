@@ -29,8 +29,7 @@ def milliseconds(bundle: Bundle) -> dict[str, float]:
     gbuffer = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     if place := channel_slices(bundle.inputs, bundle.per_channel).get("position"):
         gbuffer[:, place.stop - 1] = -np.abs(gbuffer[:, place.stop - 1]) - 4
-    backends = usable(bundle)
-    engines = {str(one): load_engine(bundle, one, threads=cpu_count()) for one in backends}
+    engines = {str(b): load_engine(bundle, b, threads=cpu_count()) for b in usable(bundle)}
     times: dict[str, list[float]] = {name: [] for name in engines}
     for turn in range(_ROUNDS + 2):
         for name, engine in engines.items():

@@ -7,6 +7,7 @@ Layout of both formats: IEEE 754-2019, table 3.5.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,19 @@ def to_float(halves: NDArray[np.float16], out: NDArray[np.float32]) -> bool:
     np.bitwise_and(target, _SIGN_AND_VALUE, out=target)
     np.multiply(out, _REBIAS, out=out)  # also makes a half's subnormals normal
     return True
+
+
+def adjacent(planes: Sequence[NDArray[np.float32]]) -> NDArray[np.float32] | None:
+    """(C, H, W) of planes (H, W) that lie one after the other in one array, uncopied; else None."""
+    block, shape, size = planes[0].base, planes[0].shape, planes[0].nbytes
+    if not (isinstance(block, np.ndarray) and block.flags.c_contiguous and size):
+        return None
+    if not all(plane.base is block and plane.flags.c_contiguous for plane in planes):
+        return None
+    at = [plane.ctypes.data - block.ctypes.data for plane in planes]
+    if np.any(np.diff(at) != size) or at[0] % size or block.nbytes % size:
+        return None
+    return block.reshape(-1, *shape)[at[0] // size : at[0] // size + len(planes)]
 
 
 def is_finite(values: NDArray[np.float32]) -> bool:

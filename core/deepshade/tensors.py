@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import Effect
+from deepshade.floats import adjacent
 
 Float = NDArray[np.float32]
 Box = tuple[int, int, int, int]  # top, bottom, left, right; the ends are exclusive
@@ -91,8 +92,10 @@ def cut(channels: Sequence[Plane], box: Box) -> Float:
     """
     height, width = channels[0].pixels.shape
     top, bottom, left, right = box
-    if box == (0, height, 0, width) and (block := _block(channels)) is not None:
-        return block[None]
+    if box == (0, height, 0, width) and not any(plane.divisor for plane in channels):
+        block = adjacent([plane.pixels for plane in channels])
+        if block is not None:
+            return block[None]
     rows, columns = min(bottom, height) - top, min(right, width) - left
     tensor = np.empty((1, len(channels), bottom - top, right - left), np.float32)
     tensor[:, :, rows:, :] = 0
@@ -142,22 +145,3 @@ def up(value: int, multiple: int) -> int:
 def _count(name: str, per_channel: bool) -> int:
     attribute = ATTRIBUTES[name]
     return 1 if per_channel and attribute.coloured else len(attribute.channels)
-
-
-def _block(channels: Sequence[Plane]) -> Float | None:
-    """(C, H, W) if the planes lie one after the other in one array, unscaled; else None."""
-    arrays = [plane.pixels for plane in channels]
-    owner = arrays[0].base
-    if any(plane.divisor is not None for plane in channels) or not (
-        isinstance(owner, np.ndarray)
-        and owner.dtype == np.float32
-        and owner.flags.c_contiguous
-        and all(array.base is owner and array.flags.c_contiguous for array in arrays)
-    ):
-        return None
-    size = arrays[0].nbytes
-    starts = [array.ctypes.data - owner.ctypes.data for array in arrays]
-    first = starts[0] // size
-    if starts != [(first + k) * size for k in range(len(arrays))]:
-        return None
-    return owner.reshape(-1, *arrays[0].shape)[first : first + len(arrays)]

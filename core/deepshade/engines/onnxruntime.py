@@ -26,11 +26,6 @@ def precisions(engine: str) -> tuple[str, ...]:
     return ("fp32",)
 
 
-def load(bundle: Bundle, backend: Backend, threads: int) -> Engine:
-    """See `deepshade.engines.load_engine`."""
-    return OnnxRuntime(bundle, backend, threads=threads)
-
-
 class OnnxRuntime(Engine):
     """One bundle in one session; predictions at the same time share its threads."""
 

@@ -51,11 +51,6 @@ def precisions(engine: str = "openvino") -> tuple[str, ...]:
     return tuple(name for name, capability in _CAPABILITIES.items() if capability in known)
 
 
-def load(bundle: Bundle, backend: Backend, threads: int) -> Engine:
-    """See `deepshade.engines.load_engine`."""
-    return OpenVino(bundle, backend, threads=threads)
-
-
 class OpenVino(Engine):
     """One bundle, compiled for each size; predictions at the same time follow each other."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from typing import Protocol, cast
+from typing import Any
 
 from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine
@@ -14,20 +14,12 @@ from deepshade.machine import cpu_kind
 # What every machine with the service has, and what the others are measured against.
 REFERENCE = Backend("onnxruntime", "fp32")
 
-# engine -> its module; the engine that is used first, by rule, comes first
+# engine -> its module and class; the engine that is used first, by rule, comes first
 _ENGINES = {
-    "cuda": "deepshade.engines.onnxruntime",
-    "openvino": "deepshade.engines.openvino",
-    "onnxruntime": "deepshade.engines.onnxruntime",
+    "cuda": ("deepshade.engines.onnxruntime", "OnnxRuntime"),
+    "openvino": ("deepshade.engines.openvino", "OpenVino"),
+    "onnxruntime": ("deepshade.engines.onnxruntime", "OnnxRuntime"),
 }
-
-
-class _Module(Protocol):
-    def precisions(self, engine: str) -> tuple[str, ...]:
-        """What `engine` calculates in here, the one to use first; EngineError if it isn't here."""
-
-    def load(self, bundle: Bundle, backend: Backend, threads: int) -> Engine:
-        """The engine, not yet warm."""
 
 
 @cache
@@ -92,8 +84,10 @@ def load_engine(bundle: Bundle, backend: Backend, *, threads: int) -> Engine:
             f"the bundle {bundle.effect}/{bundle.name} has no ranges for 8 bits",
             fix="export it again, or choose another precision",
         )
-    return _module(backend.engine).load(bundle, backend, threads)
+    kind = getattr(_module(backend.engine), _ENGINES[backend.engine][1])
+    engine: Engine = kind(bundle, backend, threads=threads)
+    return engine
 
 
-def _module(engine: str) -> _Module:
-    return cast(_Module, import_module(_ENGINES[engine]))
+def _module(engine: str) -> Any:
+    return import_module(_ENGINES[engine][0])

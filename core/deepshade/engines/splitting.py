@@ -31,7 +31,7 @@ def split(model: Any, float32: Collection[str] = ()) -> list[Piece]:
 
     model = model.clone()
     if not float32:
-        return [_piece([_source(node) for node in model.get_results()], _views(model))]
+        return [_piece([node.input_value(0) for node in model.get_results()], _views(model))]
     first = model.clone()
     outputs = _tensors(first, float32)
     given = []
@@ -40,7 +40,7 @@ def split(model: Any, float32: Collection[str] = ()) -> list[Piece]:
         for reader in tensor.get_target_inputs():
             reader.replace_source_output(entry.output(0))
         given.append(entry)
-    results = [_source(node) for node in model.get_results()]
+    results = [node.input_value(0) for node in model.get_results()]
     return [_piece(outputs, _views(first), exact=True), _piece(results, _views(model), given)]
 
 
@@ -102,10 +102,6 @@ def _piece(
     used = [view for name, view in views.items() if name in met]
     model = Model(outputs, [node for node, _ in used] + list(entries), "piece")
     return Piece(model, tuple(channels for _, channels in used), exact)
-
-
-def _source(result: Any) -> Any:
-    return result.input_value(0)
 
 
 def _sources(node: Any) -> list[Any]:

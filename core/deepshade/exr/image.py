@@ -46,14 +46,8 @@ class Image:
     def stack(self, names: Sequence[str]) -> Pixels:
         """Channels as one (C, H, W) array; no copy when they were read in this order."""
         planes = [self.pixels[name] for name in names]
-        block = planes[0].base  # (n, H, W): all planes of this size, in the order of reading
-        if block is None or block.shape[1:] != planes[0].shape:
-            return np.stack(planes)
-        start, size = block.ctypes.data, planes[0].nbytes
-        at = [(plane.ctypes.data - start) // size for plane in planes]
-        if all(plane.base is block for plane in planes) and np.all(np.diff(at) == 1):
-            return block[at[0] : at[0] + len(at)]
-        return np.stack(planes)
+        block = floats.adjacent(planes)
+        return np.stack(planes) if block is None else block
 
 
 def read_header(source: Path | str | bytes, limits: Limits | None = None) -> Header:
