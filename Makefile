@@ -36,7 +36,7 @@ setup: $(VENV)/stamp-all ## Install everything, for rendering, training and test
 	sh scripts/libllvm.sh $(BIN)/python
 
 test: setup lint types ## Lint, check types, run every test
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: setup ## Style and common mistakes
 	$(BIN)/ruff check .
