@@ -79,7 +79,9 @@ def _normal(scene: Scene, view: View, hits: Hits) -> Image:
 
 def _material(scene: Scene, view: View, hits: Hits, *, name: str) -> Image:
     start, stop = MATERIAL_CHANNELS[name]
-    return np.where(_valid(hits), hits.planar(material(hits, name, stop - start)), 0)
+    return np.where(
+        _valid(hits), hits.planar(material(scene, hits.surface, hits.valid, name, stop - start)), 0
+    )
 
 
 def _motion(scene: Scene, view: View, hits: Hits) -> Image:
@@ -88,7 +90,7 @@ def _motion(scene: Scene, view: View, hits: Hits) -> Image:
     if not view.displacements:
         return motion.astype(np.float32)
     camera, valid = view.camera, _valid(hits)
-    number = material(hits, "object", 1).numpy().astype(np.int64)
+    number = material(scene, hits.surface, hits.valid, "object", 1).numpy().astype(np.int64)
     world = scene.displacements(view.displacements)[number].T  # (3, N)
     half = (rotation_of(camera.matrix) @ world).reshape(3, hits.height, hits.width) / 2
     middle = _position(scene, view, hits).astype(np.float64)

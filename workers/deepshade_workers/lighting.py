@@ -39,15 +39,15 @@ class Phong:
     gloss: Any
 
     @classmethod
-    def at(cls, hits: Hits) -> Phong:
+    def at(cls, scene: Scene, hits: Hits) -> Phong:
         """Evaluate the materials of `hits`."""
         frame = mi.Frame3f(hits.ns)
         return cls(
             frame,
             mi.reflect(frame.to_local(toward_camera(hits))),
-            material(hits, "diffuse", 3),
-            material(hits, "specular", 3),
-            material(hits, "gloss", 1),
+            material(scene, hits.surface, hits.valid, "diffuse", 3),
+            material(scene, hits.surface, hits.valid, "specular", 3),
+            material(scene, hits.surface, hits.valid, "gloss", 1),
         )
 
     def shine(self, local: Any) -> Any:
@@ -63,7 +63,7 @@ def direct_light(scene: Scene, hits: Hits, *, samples: int, seed: int) -> tuple[
     sun's disc; 0 if the scene has no sky) and L_diff is 0. A scene without lights of its own has
     the default sun and sky, and a lamp at the camera so that closed rooms aren't black.
     """
-    phong = Phong.at(hits)
+    phong = Phong.at(scene, hits)
     part, shone = _sample_lights(scene, hits, phong, samples, seed)
     if not scene.lit and hits.valid.numpy().any():
         # No shadow ray: whatever the camera sees, a lamp at the camera lights.

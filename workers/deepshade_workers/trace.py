@@ -73,18 +73,18 @@ def offset_origin(point: Any, normal: Any, scene: Scene) -> Any:
     return dr.fma(normal, magnitude * ORIGIN_OFFSET, point)
 
 
-def material(hits: Hits, name: str, channels: int) -> Any:
-    """A Phong term or the "object" number at the hits: a Dr.Jit array of 1 or 3 channels.
+def material(scene: Scene, surface: Any, valid: Any, name: str, channels: int) -> Any:
+    """A Phong term or the "object" number at interactions with a scene: 1 or 3 channels.
 
-    Our meshes carry it per face. A Mitsuba XML scene's shapes tell only their diffuse
-    reflectance; all else is 0.
+    `surface` is Mitsuba's interaction, `valid` where there is one. Our meshes carry the values per
+    face. A Mitsuba XML scene's shapes tell only their diffuse reflectance; all else is 0.
     """
-    shape, si = hits.surface.shape, hits.surface
+    shape = surface.shape
     key = f"face_{name}"
-    known = shape.has_attribute(key, hits.valid)
+    known = shape.has_attribute(key, valid)
     if channels == 1:
-        return dr.select(known, shape.eval_attribute_1(key, si, known), 0)
+        return dr.select(known, shape.eval_attribute_1(key, surface, known), 0)
     other = mi.Color3f(0)
     if name == "diffuse":
-        other = si.bsdf().eval_diffuse_reflectance(si, hits.valid)
-    return dr.select(known, shape.eval_attribute_3(key, si, known), other)
+        other = surface.bsdf().eval_diffuse_reflectance(surface, valid)
+    return dr.select(known, shape.eval_attribute_3(key, surface, known), other)

@@ -18,12 +18,31 @@ Images = dict[str, Image]
 
 
 @dataclass(frozen=True)
+class Light:
+    """What lights a view in place of the scene's own lights: a lamp and a sky.
+
+    The lamp is a sphere of `size` (its radius, scene units; 0 is a point) at `position` (world
+    space). `intensity` is its radiant intensity (RGB): a surface that faces it at the distance r
+    receives the irradiance intensity / r². The sky's radiance (RGB) turns from `zenith` above over
+    `horizon` to `ground` below.
+    """
+
+    position: Vector
+    size: float
+    intensity: Vector
+    zenith: Vector
+    horizon: Vector
+    ground: Vector
+
+
+@dataclass(frozen=True)
 class View:
     """A camera with the settings of what is seen through it; None where they aren't set.
 
     `radius`, `focus` (distance) and `aperture` (diameter) are in scene units, `shutter` in frames,
     `environment` is a map's name. `displacements` says by name how far objects of the scene move
     while the shutter is open, (x, y, z) in world space; the picture is of the middle of that time.
+    Without a `light` the scene's own lights, or its default ones, count.
     """
 
     camera: Camera
@@ -33,6 +52,7 @@ class View:
     shutter: float | None = None
     environment: str | None = None
     displacements: Mapping[str, Vector] = field(default_factory=dict)
+    light: Light | None = None
 
     def settings(self) -> dict[str, float | str]:
         """The settings that are set, by their names in `deepshade.effects.SETTINGS`."""
