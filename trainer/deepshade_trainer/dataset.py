@@ -51,12 +51,17 @@ class Entry:
 class Dataset:
     """All samples of one effect in one or several data folders.
 
+    `per_channel` says whether networks see one colour channel; None: as the effect's row does.
+
     Raises:
         DataError: a folder holds no manifest, lacks a shard, or was made for other effects.
     """
 
-    def __init__(self, folders: Sequence[Path], effect: str) -> None:
+    def __init__(
+        self, folders: Sequence[Path], effect: str, *, per_channel: bool | None = None
+    ) -> None:
         self.effect = EFFECTS[effect]
+        self.per_channel = self.effect.per_channel if per_channel is None else per_channel
         self.reference = f"reference_{effect}"
         trivial = self.effect.trivial
         self.attributes = tuple(
@@ -117,18 +122,18 @@ class Dataset:
         return float(self.entries[number].record.get("radius", 1.0))
 
     def gbuffer(self, sample: Sample, radius: float, multiple: int = 1) -> NDArray[np.float32]:
-        """What a network sees of a sample (N, C, h, w); N is 3 for an effect run per channel.
+        """What a network sees of a sample (N, C, h, w); N is 3 for networks run per channel.
 
         Sides are padded to multiples of `multiple`.
         """
-        given, runs = (self.effect, sample, self.effect.inputs, radius), self.effect.per_channel
-        return tensors.tensor(*given, per_channel=runs, multiple=multiple)
+        given = self.effect, sample, self.effect.inputs, radius
+        return tensors.tensor(*given, per_channel=self.per_channel, multiple=multiple)
 
     def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """G-buffers (N, C, H, W) and references (N, outputs, H, W) to learn from.
 
         Each sample is turned by one of the effect's symmetries; some have 16-bit lengths, some
-        directions that are too short; an effect run per channel sees one colour channel.
+        directions that are too short; networks run per channel see one colour channel.
         """
         effect = self.effect
         inputs, references = [], []
@@ -143,7 +148,7 @@ class Dataset:
                 turned |= {name: rounded(turned[name]) for name in lengths(effect.inputs)}
             if rng.random() < SHORT_DIRECTIONS:
                 turned |= shortened(turned, directions(effect.inputs), MIN_DIRECTION, rng)
-            channel = int(rng.integers(3)) if effect.per_channel else None
+            channel = int(rng.integers(3)) if self.per_channel else None
             scale = tensors.length_scale(effect, turned, self.radius(number))
             planes = tensors.planes(turned, effect.inputs, scale, channel=channel)
             height, width = turned[self.reference].shape[1:]

@@ -92,7 +92,10 @@ def evaluate(
         DataError: no sample does.
         EngineError: this machine or this bundle lacks the backend.
     """
-    data, shader = Dataset(folders, bundle.effect), Shaded(bundle, backend)
+    data, shader = (
+        Dataset(folders, bundle.effect, per_channel=bundle.per_channel),
+        Shaded(bundle, backend),
+    )
     effect, variant = data.effect, variant or Variant()
     least = effect.min_contrast if min_contrast is None else min_contrast
     for name in variant.half:

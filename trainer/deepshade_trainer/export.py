@@ -68,7 +68,7 @@ def export(
     """
     recipe, shader = load_shader(run)
     effect = EFFECTS[recipe.effect]
-    trained, held = gbuffers(recipe, data)
+    trained, held = gbuffers(recipe, data, shader.per_channel)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).unlink(missing_ok=True)  # no bundle while its graph changes
     graph = write_onnx(shader, folder / MODEL)
@@ -93,7 +93,7 @@ def export(
             for name, place in shader.places.items()
         },
         "bytes_per_pixel": bytes_per_pixel(graph, INPUT, (shader.channels, side, side)),
-        "per_channel": effect.per_channel,
+        "per_channel": shader.per_channel,
         "float32": float32_boundary(graph),
         "int8": int8_ranges(graph, INPUT, [each.numpy() for each in trained]),
         "network": asdict(recipe.network),
@@ -104,12 +104,14 @@ def export(
     return write_config(folder, config, metrics), worst
 
 
-def gbuffers(recipe: Recipe, folders: Sequence[Path]) -> tuple[list[Tensor], list[Tensor]]:
+def gbuffers(
+    recipe: Recipe, folders: Sequence[Path], per_channel: bool
+) -> tuple[list[Tensor], list[Tensor]]:
     """G-buffers (N, C, H, W) of samples that were trained on, and of some that were held out.
 
     Where none was held out, the second are of the first.
     """
-    samples = Dataset(folders, recipe.effect)
+    samples = Dataset(folders, recipe.effect, per_channel=per_channel)
     training, held = samples.split(recipe.val_fraction, seed=recipe.seed)
 
     def some(numbers: Sequence[int], count: int) -> list[Tensor]:

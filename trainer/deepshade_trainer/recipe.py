@@ -123,12 +123,13 @@ def _channels(effect: Effect, kind: str) -> dict[str, Any]:
 
     Only positions in effect radii have horizons.
     """
+    per_channel = effect.per_channel and kind != "carrier"
     found: dict[str, Any] = {
         "kind": kind,
-        "inputs": channel_count(effect.inputs, effect.per_channel),
-        "outputs": 1 if effect.per_channel else len(effect.outputs),
+        "inputs": channel_count(effect.inputs, per_channel),
+        "outputs": 1 if per_channel else len(effect.outputs),
     }
-    places = channel_slices(effect.inputs, effect.per_channel)
+    places = channel_slices(effect.inputs, per_channel)
     if kind == "fold" and effect.lengths == "radius" and {"normal", "position"} <= places.keys():
         found |= {name: places[name].start for name in ("normal", "position")}
     return found

@@ -25,6 +25,7 @@ from deepshade_trainer.dataset import Batch, Dataset, batches
 from deepshade_trainer.losses import dssim, parse_loss
 from deepshade_trainer.networks import Network, Shader, build, bundle_weights
 from deepshade_trainer.recipe import Recipe
+from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
 
 SAVE_EVERY = 250
@@ -64,7 +65,16 @@ def train(
 class _Trainer:
     def __init__(self, recipe: Recipe, folders: Sequence[Path], run: Run, device: str) -> None:
         self.recipe, self.run, self.device = recipe, run, torch.device(device)
-        self.data = Dataset(folders, recipe.effect)
+        torch.manual_seed(recipe.seed)
+        self.network = build(recipe.network).to(self.device)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.shader = Shader(EFFECTS[recipe.effect], self.network)
+        runs = self.shader.per_channel
+        self.data = (
+            Dataset(folders, recipe.effect, per_channel=runs)
+            if self.device.type == "cpu"
+            else Resident(folders, recipe.effect, per_channel=runs, device=self.device)
+        )
         self.training, held = self.data.split(recipe.val_fraction, seed=recipe.seed)
         if len(self.training) < recipe.batch:
             raise DataError(
@@ -73,10 +83,6 @@ class _Trainer:
             )
         self.warnings: list[str] = []
         self.held = self._judged(held)
-        torch.manual_seed(recipe.seed)
-        self.network = build(recipe.network).to(self.device)
-        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.shader = Shader(EFFECTS[recipe.effect], self.network)
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimizer = _optimizer(recipe, self.network)
         self.loss = parse_loss(recipe.loss)
@@ -194,7 +200,7 @@ class _Trainer:
         mixed = recipe.precision == "bf16"
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
             image = self.shader.on_curve(gbuffer)
-        loss = self.loss(image, self.shader.curve(reference))
+        loss = self.loss(*self.shader.compared(image, reference))
         self.optimizer.zero_grad(set_to_none=True)
         if not torch.isfinite(loss):
             return math.nan, f"loss {float(loss)}"

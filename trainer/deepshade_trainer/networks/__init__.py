@@ -13,6 +13,7 @@ from torch import Tensor
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
+from deepshade_trainer.networks.carrier import Carrier, CarrierConfig
 from deepshade_trainer.networks.chain import Chain, ChainConfig
 from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet
 from deepshade_trainer.networks.network import Network
@@ -30,9 +31,10 @@ __all__ = [
     "network_config",
 ]
 
-NetworkConfig = ChainConfig | FoldConfig | PaperConfig
+NetworkConfig = CarrierConfig | ChainConfig | FoldConfig | PaperConfig
 
 _KINDS: dict[str, tuple[Any, Any]] = {
+    "carrier": (CarrierConfig, Carrier),
     "chain": (ChainConfig, Chain),
     "fold": (FoldConfig, FoldUNet),
     "paper": (PaperConfig, PaperUNet),

@@ -121,7 +121,7 @@ class FoldUNet(Network):
         told: list[Tensor] = []
         masks: list[Tensor | None] = [None] * len(config.widths)
         if self.geometric:
-            with _full_precision():
+            with full_precision():
                 near, nearest, told, masks = self.features(gbuffer)
             x = x + self.horizon(near)
             if nearest is not None:
@@ -138,7 +138,7 @@ class FoldUNet(Network):
             x = F.relu(skips[n] + self.upsample[n](x))  # (N, widths[n], step h, step w)
             x = self.decode[n](x, masks[n])
         # bf16 has only 1/256 between 0.5 and 1, where most of an occlusion image lies.
-        with _full_precision():
+        with full_precision():
             x = self.head(x.to(self.head.weight.dtype)).float()  # (N, outputs fold², h, w)
             return F.pixel_shuffle(x, config.fold)  # (N, outputs, H, W)
 
@@ -269,7 +269,7 @@ def _stack(width: int, count: int) -> Stack:
 
 
 @contextmanager
-def _full_precision() -> Iterator[None]:
+def full_precision() -> Iterator[None]:
     """No automatic 16-bit arithmetic inside."""
     with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
         yield

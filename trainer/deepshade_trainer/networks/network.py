@@ -20,6 +20,9 @@ class Network(nn.Module, ABC):
     tiles equal the whole.
     """
 
+    # Whether light passes linearly, all three colours at once: then no curve stands before or after.
+    linear = False
+
     @property
     @abstractmethod
     def size_multiple(self) -> int:

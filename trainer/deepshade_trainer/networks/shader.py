@@ -13,11 +13,14 @@ from deepshade.tensors import channel_slices
 from deepshade_trainer.networks.horizons import covered
 from deepshade_trainer.networks.network import Network
 
+_BLACK = 1e-30  # of radiance
+
 
 class Shader(nn.Module):
     """A G-buffer (N, C, H, W), as `deepshade.tensors` makes it, to the effect's answer.
 
-    The network sees light through the effect's transfer curve and answers on it. Where the
+    The network sees light through the effect's transfer curve and answers on it, but one that is
+    linear in light, which carries all three colours at once. Where the
     effect's background is a number, that number stands where there is no surface. In evaluation
     mode the answer is kept within the effect's range; in training nothing is clamped.
     """
@@ -25,7 +28,9 @@ class Shader(nn.Module):
     def __init__(self, effect: Effect, network: Network) -> None:
         super().__init__()
         self.effect, self.network = effect, network
-        self.places = channel_slices(effect.inputs, effect.per_channel)
+        self.transfer = "linear" if network.linear else effect.transfer
+        self.per_channel = effect.per_channel and not network.linear
+        self.places = channel_slices(effect.inputs, self.per_channel)
         self.lights = [
             self.places[name] for name in effect.inputs if ATTRIBUTES[name].unit is RADIANCE
         ]
@@ -54,7 +59,7 @@ class Shader(nn.Module):
 
     def forward(self, gbuffer: Tensor) -> Tensor:
         """(N, C, H, W) to the answer (N, outputs, H, W), float32, in physical units."""
-        image: Tensor = transfer.inverse(self.on_curve(gbuffer), self.effect.transfer, torch)
+        image: Tensor = transfer.inverse(self.on_curve(gbuffer), self.transfer, torch)
         unbounded = self.training or self.effect.range == (None, None)
         return image if unbounded else image.clamp(*self.effect.range)
 
@@ -67,12 +72,26 @@ class Shader(nn.Module):
 
     def curve(self, image: Tensor) -> Tensor:
         """Light or answers through the transfer curve."""
-        seen: Tensor = transfer.forward(image, self.effect.transfer, torch)
+        seen: Tensor = transfer.forward(image, self.transfer, torch)
         return seen
+
+    def compared(self, image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
+        """What `on_curve` gave and the reference (N, outputs, H, W), as losses compare them.
+
+        Light that passed linearly is exposed as when it is judged, each picture by its reference;
+        what would be clipped then is bent instead, so that it still teaches.
+        """
+        if not self.network.linear:
+            return image, self.curve(reference)
+        flat = reference.flatten(1)
+        white = torch.quantile(flat, 0.99, dim=1)
+        white = torch.where(white > _BLACK, white, flat.amax(1).clamp_min(_BLACK))
+        factor = (1 / white)[:, None, None, None]
+        return _bent(image * factor), _bent(reference * factor)
 
     def _seen(self, gbuffer: Tensor) -> Tensor:
         """The G-buffer with its light on the curve."""
-        if not self.lights or self.effect.transfer == "linear":
+        if not self.lights or self.transfer == "linear":
             return gbuffer
         pieces = [gbuffer[:, place] for place in self.places.values()]
         return torch.cat(
@@ -89,3 +108,8 @@ class Shader(nn.Module):
             last = self.places["position"].stop
             return covered(gbuffer[:, last - 1 : last])
         return covered(-gbuffer[:, self.places["depth"]])
+
+
+def _bent(image: Tensor) -> Tensor:
+    """The identity up to 1, a logarithm above."""
+    return torch.where(image > 1, 1 + torch.log(image.clamp_min(1)), image)

@@ -3,6 +3,6 @@
 from deepshade_trainer.presets.paper import PAPER
 
 PRESETS = {
-    "balanced": {},
+    "balanced": {"network": {"kind": "carrier", "bases": "discs"}},
     "paper": {**PAPER, "network": {"kind": "paper", "u0": 8, "levels": 5}},
 }
