@@ -18,7 +18,7 @@ from deepshade.camera import Camera
 from deepshade_workers.backend import mitsuba
 from deepshade_workers.sampling import pixel_streams, random_pair, strata
 from deepshade_workers.scenes.scene import Scene
-from deepshade_workers.trace import Hits, material, offset_origin, trace
+from deepshade_workers.trace import Hits, eye_of, material, normals_toward, offset_origin, trace
 from deepshade_workers.view import Image, Light, Vector, View
 
 mi = mitsuba()
@@ -116,6 +116,19 @@ def leaving(
         part += diffuse
         whole += diffuse + phong.shine(local) * irradiance
     return part, whole
+
+
+def seen_along(scene: Scene, view: View, ray: Any, first: Any, second: Any) -> Any:
+    """What `ray` meets as the pinhole would see it: L (Color3f) toward the eye, or the sky.
+
+    `first` and `second` are as for `leaving`. The seen side of a surface is the ray's.
+    """
+    surface = scene.traced.ray_intersect(ray)
+    valid = surface.is_valid()
+    ng, ns = normals_toward(surface, ray)
+    toward = dr.normalize(eye_of(view.camera) - surface.p)
+    _, whole = leaving(scene, view, surface, valid, ng, ns, toward, first, second)
+    return dr.select(valid, whole, sky(scene, view, ray.d))
 
 
 def sky(scene: Scene, view: View, direction: Any) -> Any:

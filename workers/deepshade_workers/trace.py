@@ -49,9 +49,8 @@ def trace(scene: Scene, camera: Camera, width: int, height: int) -> Hits:
     local = camera.rays(width, height).reshape(3, -1).astype(np.float64)
     length = np.linalg.norm(local, axis=0)
     world = rotation_of(camera.matrix).T @ (local / length)
-    eye = camera.eye
     ray = mi.Ray3f(
-        mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in eye)),
+        eye_of(camera),
         mi.Vector3f(*(mi.Float(row.astype(np.float32)) for row in world)),
     )
     si = scene.traced.ray_intersect(ray)
@@ -61,6 +60,25 @@ def trace(scene: Scene, camera: Camera, width: int, height: int) -> Hits:
     depth = si.t / mi.Float(length.astype(np.float32))
     dr.eval(si, valid, ng, ns, depth, back)
     return Hits(width, height, valid, si.p, ng, ns, depth, back, si)
+
+
+def eye_of(camera: Camera) -> Any:
+    """The camera's place in world space."""
+    return mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.eye))
+
+
+def pixel_rays(camera: Camera, width: int, height: int) -> Any:
+    """Camera-space directions with z = -1 through the centres of the window's pixels, row-major."""
+    return mi.Vector3f(*(mi.Float(row) for row in camera.rays(width, height).reshape(3, -1)))
+
+
+def turn_to_world(camera: Camera, vector: Any) -> Any:
+    """A camera-space `vector` in world space."""
+    x, y, z = (
+        mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in axis))
+        for axis in rotation_of(camera.matrix)
+    )
+    return x * vector.x + y * vector.y + z * vector.z
 
 
 def normals_toward(surface: Any, ray: Any) -> tuple[Any, Any]:
