@@ -20,7 +20,7 @@ class Network(nn.Module, ABC):
     tiles equal the whole.
     """
 
-    # Whether light passes linearly, all three colours at once: then no curve stands before or after.
+    # Whether light passes linearly, three colours at once: then no curve stands before or after.
     linear = False
 
     @property

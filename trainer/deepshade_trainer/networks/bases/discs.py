@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from deepshade_trainer.networks.bases.base import Bases, State
 from deepshade_trainer.networks.receptive_field import Span, doubled, folded, grown, joined
 
-# The discs' radii are 0, 1 and 2 pixels at full resolution, 4 and 8 at half, 16 and 24 at a quarter;
+# The discs' radii are 0 and 1 pixels at full resolution, 2, 4 and 8 at half, 16 and 24 at a quarter;
 # a circle between two of them is shared out to both.
 _FAINT = 1e-3  # what is hidden still counts where nothing else is there
 _SURE = 4.0  # weights end at e^±4
@@ -28,8 +28,8 @@ class Discs(Bases):
     hidden is continued from around. Weights change how much each layer counts.
     """
 
-    told = 6
-    weights = 5
+    told = 5
+    weights = 4
     size_multiple = 4
 
     disc1: Tensor
@@ -42,7 +42,7 @@ class Discs(Bases):
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("disc1", _discs(1, 4), persistent=False)
-        self.register_buffer("disc2", _discs(2, 4), persistent=False)
+        self.register_buffer("disc2", _discs(2 / 2, 8), persistent=False)
         self.register_buffer("disc4", _discs(4 / 2, 8), persistent=False)
         self.register_buffer("disc8", _discs(8 / 2, 8), persistent=False)
         self.register_buffer("disc16", _discs(16 / 4, 8), persistent=False)
@@ -52,40 +52,38 @@ class Discs(Bases):
         """See `Bases.features`."""
         focal, light = torch.split(gbuffer, [1, 3], 1)
         radius = focal.abs() * 0.5
-        lit = torch.cat([torch.ones_like(radius), light], 1)  # premultiplied by what follows
-        sharp = (1 - radius).clamp(0, 1)
-        one = torch.minimum(radius, 2 - radius).clamp(0, 1)
-        two = torch.minimum(radius - 1, 2 - radius * 0.5).clamp(0, 1)
-        wide = (radius * 0.5 - 1).clamp(0, 1)
-        layers = [sharp * lit, _spread(one * lit, self.disc1), _spread(two * lit, self.disc2)]
-        near = wide * (focal < 0)
-        sides = [_sized(side, lit, radius) for side in (near, wide - near)]
-        mild = torch.cat([lit_ * _hat(r, 0.0, 4.0, 8.0) for lit_, r in sides], 1)
-        more = torch.cat([lit_ * _hat(r, 4.0, 8.0, 16.0) for lit_, r in sides], 1)
-        strong = torch.cat([lit_ * _hat(r, 8.0, 16.0, 24.0) for lit_, r in sides], 1)
-        most = torch.cat([lit_ * ((r - 16) / 8).clamp(0, 1) for lit_, r in sides], 1)
-        mild = _spread(mild, self.disc4) + _spread(more, self.disc8)  # (N, 8, H / 2, W / 2)
-        strong = _spread(F.avg_pool2d(strong, 2), self.disc16) + _spread(
-            F.avg_pool2d(most, 2), self.disc24
-        )
+        lit = torch.cat([torch.ones_like(radius), light], 1)  # (N, 4, H, W), premultiplied below
+        sharp = lit * (1 - radius).clamp(0, 1)
+        one = _spread(lit * torch.minimum(radius, 2 - radius).clamp(0, 1), self.disc1)
+        near, close = _side(lit, (focal * -0.5 - 1).clamp(0, 1), radius)
+        far, distant = _side(lit, (focal * 0.5 - 1).clamp(0, 1), radius)
+
+        def layer(low: float, middle: float, high: float) -> Tensor:
+            hats = _hat(close, low, middle, high), _hat(distant, low, middle, high)
+            return torch.cat([near * hats[0], far * hats[1]], 1)  # (N, 8, H / 2, W / 2)
+
+        mild = _spread(layer(0, 2, 4), self.disc2) + _spread(layer(2, 4, 8), self.disc4)
+        mild = mild + _spread(layer(4, 8, 16), self.disc8)
+        strong = _spread(F.avg_pool2d(layer(8, 16, 24), 2), self.disc16)
+        strong = strong + _spread(F.avg_pool2d(layer(16, 24, 0), 2), self.disc24)
         strong = _twice(strong)
         # The nearer lies over the farther: before the focus that is what is blurred more.
         over = strong[:, :4] + (1 - strong[:, :1].clamp(max=1)) * mild[:, :4]
         under = mild[:, 4:] + (1 - mild[:, 4:5].clamp(max=1)) * strong[:, 4:]
-        layers += list(torch.split(_twice(torch.cat([over, under], 1)), 4, 1))
-        cover = [layer[:, :1] for layer in layers]
+        layers = sharp, one, _twice(over), _twice(under)
+        cover = [each[:, :1] for each in layers]
         told = torch.cat([focal / (focal.abs() + 4), *(each.clamp(max=2) for each in cover)], 1)
-        return told, tuple(layers)
+        return told, layers
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
-        sharp, one, two, near, far = state
+        sharp, one, near, far = state
         gains = torch.split(torch.exp(torch.tanh(weights / _SURE) * _SURE), 1, 1)
         left = 1 - near[:, :1].clamp(max=1)
-        behind = left * (1 - (sharp[:, :1] + one[:, :1] + two[:, :1]).clamp(max=1)) + _FAINT
+        behind = left * (1 - (sharp[:, :1] + one[:, :1]).clamp(max=1)) + _FAINT
         left = left + _FAINT
-        total = near * gains[3] + far * (behind * gains[4])
-        total = total + left * (sharp * gains[0] + one * gains[1] + two * gains[2])
+        total = near * gains[2] + far * (behind * gains[3])
+        total = total + sharp * (left * gains[0]) + one * (left * gains[1])
         return total[:, 1:] / total[:, :1].clamp_min(1e-12)
 
     def receptive_field(self, pixel: int) -> Span:
@@ -93,20 +91,19 @@ class Discs(Bases):
         half = doubled((pixel, pixel))
         quarter = grown(doubled(half), self.disc24.shape[-1] // 2)
         wide = joined(grown(half, self.disc8.shape[-1] // 2), folded(quarter, 2))
-        return joined(folded(wide, 2), grown((pixel, pixel), self.disc2.shape[-1] // 2))
+        return joined(folded(wide, 2), grown((pixel, pixel), self.disc1.shape[-1] // 2))
 
 
-def _sized(side: Tensor, lit: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+def _side(lit: Tensor, share: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
     """One side of the focus at half resolution: premultiplied (N, 4, h, w), and its radius."""
-    pooled = F.avg_pool2d(torch.cat([side * lit, side * radius], 1), 2)
-    lit, radius = torch.split(pooled, [4, 1], 1)
-    return lit, radius / lit[:, :1].clamp_min(1e-6)
+    half = F.avg_pool2d(lit * share, 2)
+    return half, F.avg_pool2d(radius * share, 2) / half[:, :1].clamp_min(1e-6)
 
 
 def _hat(x: Tensor, low: float, middle: float, high: float) -> Tensor:
-    """1 at `middle`, falling to 0 at `low` and at `high`; 1 below where `low` is 0."""
-    fall = (high - x) / (high - middle)
-    return (fall if low == 0 else torch.minimum((x - low) / (middle - low), fall)).clamp(0, 1)
+    """1 at `middle`, falling to 0 at `low` and at `high`; a 0 for one of these: 1 to that side."""
+    rise, fall = (x - low) / (middle - low), (high - x) / (high - middle)
+    return (rise if not high else fall if not low else torch.minimum(rise, fall)).clamp(0, 1)
 
 
 def _discs(radius: float, count: int) -> Tensor:

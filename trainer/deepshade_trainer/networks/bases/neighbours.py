@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from deepshade_trainer.networks.bases.base import Bases, State
-from deepshade_trainer.networks.receptive_field import Span, grown
+from deepshade_trainer.networks.receptive_field import Span, grown, joined
 
 # Rows down and columns right.
 _AROUND = ((0, 1), (1, 0), (0, -1), (-1, 0))
@@ -20,8 +20,8 @@ _START = -5.0
 class Neighbours(Bases):
     """The pixel and its four neighbours; input: depth (1), light (3).
 
-    A weight moves light from its neighbour: share_k = exp(weight_k) / (1 + Σ exp(weight)). (Blending
-    with a neighbour is what morphological anti-aliasing does: Jimenez et al., "SMAA: Enhanced
+    A weight moves light from its neighbour: share_k = exp(weight_k) / (1 + Σ exp(weight)).
+    (Blending with a neighbour is what morphological anti-aliasing does: Jimenez et al., "SMAA: Enhanced
     Subpixel Morphological Antialiasing", 2012.) The network is told light relative to that of the
     block of pixels, and depth relative to the nearest around.
     """
@@ -33,28 +33,28 @@ class Neighbours(Bases):
     def features(self, gbuffer: Tensor) -> tuple[Tensor, State]:
         """See `Bases.features`."""
         depth, light = torch.split(gbuffer, [1, 3], 1)
+        count, _, height, width = light.shape
         level = F.avg_pool2d(light, _BLOCK).mean(1, keepdim=True)  # (N, 1, H / 8, W / 8)
-        level = F.interpolate(level, scale_factor=_BLOCK, mode="bilinear", align_corners=False)
-        seen = light / (light + level + _TINY)  # in [0, 1], 1/2 for the block's own
-        near = 1 / (1 + depth)  # of the median depth; background is 0
-        return torch.cat([seen, near * (depth > 0)], 1), (light,)
+        level = level[..., None, :, None] + _TINY
+        blocks = light.reshape(count, 3, height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
+        seen = (blocks / (blocks + level)).reshape(light.shape)  # in [0, 1], 1/2 for the level
+        near = (depth > 0) / (1 + depth)  # of the median depth; background is 0
+        return torch.cat([seen, near], 1), (light,)
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
         (light,) = state
         height, width = light.shape[2:]
-        shares = torch.exp((weights + _START).clamp(max=12.0))
-        total = 1 / (1 + shares.sum(1, keepdim=True))
         wide = F.pad(light, (1, 1, 1, 1), mode="replicate")
-        image = light * total
-        for (down, right), share in zip(_AROUND, torch.split(shares * total, 1, 1), strict=True):
-            image = (
-                image
-                + share * wide[:, :, 1 + down : 1 + down + height, 1 + right : 1 + right + width]
-            )
-        return image
+        image, total = light, torch.ones_like(light[:, :1])
+        shares = torch.split(torch.exp((weights + _START).clamp(max=12.0)), 1, 1)
+        for (down, right), share in zip(_AROUND, shares, strict=True):
+            rows, columns = slice(1 + down, 1 + down + height), slice(1 + right, 1 + right + width)
+            image = image + share * wide[:, :, rows, columns]
+            total = total + share
+        return image / total
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        first, last = grown((pixel, pixel), 1)
-        return (first // _BLOCK - 1) * _BLOCK, (last // _BLOCK + 2) * _BLOCK - 1
+        block = pixel // _BLOCK * _BLOCK
+        return joined(grown((pixel, pixel), 1), (block, block + _BLOCK - 1))
