@@ -19,7 +19,7 @@ mi = mitsuba()
 # Streams of other references must not repeat here.
 STREAM = 0x73636174
 # Cosine between a surface and the view at which footprints stop growing: they would reach beyond
-# the edges of what is round. A sphere's last 1.8 degrees count less, 1.6 % of the half that is seen.
+# the edges of what is round. Of a sphere only the last 1.8 degrees count less.
 GRAZING = 1 / 32
 # Least mean free path, pixels: at a thousandth all light leaves the pixel that it enters.
 LEAST = 1e-3
