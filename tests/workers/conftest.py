@@ -45,3 +45,34 @@ def corner() -> Any:
     floor = quad((0, 0, 0), (500, 0, 0), (0, 0, -500))
     wall = quad((0, 0, -1), (500, 0, 0), (0, 500, 0))
     return Scene.from_mesh("corner", merge([floor, wall]))
+
+
+def matte(mesh: Any, diffuse: float = 0.7) -> Any:
+    """The mesh with that diffuse reflectance and no highlight."""
+    mesh.materials[:, :3], mesh.materials[:, 3:6] = diffuse, 0
+    return mesh
+
+
+def lit(
+    position: Any = (0, 0, 0),
+    *,
+    intensity: float = 0.0,
+    size: float = 0.0,
+    zenith: float = 0.0,
+    horizon: float = 0.0,
+    ground: float = 0.0,
+) -> Any:
+    """A grey view light; all of it is dark unless said."""
+    from deepshade_workers.view import Light
+
+    x, y, z = position
+    return Light((x, y, z), size, (intensity,) * 3, (zenith,) * 3, (horizon,) * 3, (ground,) * 3)
+
+
+def assert_within(value: Any, error: Any, expected: Any) -> None:
+    """The mean residual lies within 3 standard errors, and few single ones don't."""
+    residual = np.asarray(value, np.float64) - expected
+    sigma = np.sqrt((np.asarray(error, np.float64) ** 2).sum()) / residual.size
+    tiny = 1e-5 * np.abs(expected).max()
+    assert abs(residual.mean()) <= 3 * sigma + tiny
+    assert (np.abs(residual) > 4 * error + 0.02 * np.abs(expected).max()).mean() < 0.01

@@ -69,13 +69,14 @@ def test_the_sun_lights_what_faces_it(tmp_path: Path) -> None:
     from deepshade.camera import Camera
     from deepshade_workers.lighting import LAMP, direct_light
     from deepshade_workers.trace import trace
+    from deepshade_workers.view import View
 
     from .conftest import quad
 
     scene = Scene.from_mesh("floor", quad((0, 0, 0), (9, 0, 0), (0, 0, -9)))
     camera = Camera.look_at((0, 3, 0), (0, 0, 0), (0, 0, -1), 8, 16, 16)
     hits = trace(scene, camera, 16, 16)
-    _, diffuse = direct_light(scene, hits, samples=4096, seed=1)
+    _, diffuse = direct_light(scene, View(camera, 1.0), hits, samples=4096, seed=1)
     sun = np.array(SUN_DIRECTION) / np.linalg.norm(SUN_DIRECTION)
     irradiance = SUN_IRRADIANCE * -sun[1] + np.pi * SKY_RADIANCE + LAMP
     assert diffuse.mean() == pytest.approx(0.7 / np.pi * irradiance, rel=0.02)

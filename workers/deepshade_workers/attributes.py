@@ -16,18 +16,26 @@ from deepshade_workers.scenes.scene import MATERIAL_CHANNELS, Scene
 from deepshade_workers.trace import Hits, material
 from deepshade_workers.view import Image, Images, View
 
+# The fewest rays a pixel that light takes: noise of the input counts as error of the answer.
 LIGHT_SAMPLES = 64
 # Where an object moves through the plane of the camera, projections end at this share of its depth.
 MIN_DEPTH = 1e-3
 
 
 def make_attributes(
-    scene: Scene, view: View, hits: Hits, names: Iterable[str], *, seed: int
+    scene: Scene,
+    view: View,
+    hits: Hits,
+    names: Iterable[str],
+    *,
+    seed: int,
+    samples: int = LIGHT_SAMPLES,
 ) -> Images:
     """Planar (C, H, W) float32 images of the attributes `names`, and of those they derive from.
 
     Background pixels hold 0, but infinite depth, and what attributes say of the background (the
-    sky's light, the blur at infinity, the direction to the camera). `seed` is that of the light.
+    sky's light, the blur at infinity, the direction to the camera). `samples` (at least
+    64 are taken) and `seed` are those of the light.
 
     Raises:
         ConfigError: an attribute needs a setting that the view lacks.
@@ -47,7 +55,8 @@ def make_attributes(
     wanted |= {need for step in steps for need in step.needs}
     images = {name: make(scene, view, hits) for name, make in _TRACED.items() if name in wanted}
     if not wanted.isdisjoint(_LIGHT):
-        light = direct_light(scene, hits, samples=LIGHT_SAMPLES, seed=seed)
+        count = max(samples, LIGHT_SAMPLES)
+        light = direct_light(scene, view, hits, samples=count, seed=seed)
         images |= {name: image for name, image in zip(_LIGHT, light, strict=True) if name in wanted}
     images = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
     source = derivation.Source(images, _valid(hits), camera, camera.matrix, header)
@@ -80,7 +89,9 @@ def _normal(scene: Scene, view: View, hits: Hits) -> Image:
 def _material(scene: Scene, view: View, hits: Hits, *, name: str) -> Image:
     start, stop = MATERIAL_CHANNELS[name]
     return np.where(
-        _valid(hits), hits.planar(material(scene, hits.surface, hits.valid, name, stop - start)), 0
+        _valid(hits),
+        hits.planar(material(scene, view, hits.surface, hits.valid, name, stop - start)),
+        0,
     )
 
 
@@ -90,7 +101,7 @@ def _motion(scene: Scene, view: View, hits: Hits) -> Image:
     if not view.displacements:
         return motion.astype(np.float32)
     camera, valid = view.camera, _valid(hits)
-    number = material(scene, hits.surface, hits.valid, "object", 1).numpy().astype(np.int64)
+    number = material(scene, view, hits.surface, hits.valid, "object", 1).numpy().astype(np.int64)
     world = scene.displacements(view.displacements)[number].T  # (3, N)
     half = (rotation_of(camera.matrix) @ world).reshape(3, hits.height, hits.width) / 2
     middle = _position(scene, view, hits).astype(np.float64)

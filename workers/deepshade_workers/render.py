@@ -44,7 +44,7 @@ def render_sample(
     references = {effect: reference_of(effect) for effect in effects}
     names = {*attributes, *(name for effect in references for name in EFFECTS[effect].inputs)}
     hits = trace(scene, view.camera, width, height)
-    images = make_attributes(scene, view, hits, names, seed=seed)
+    images = make_attributes(scene, view, hits, names, seed=seed, samples=samples)
     for effect, reference in references.items():
         value, error = reference(scene, view, hits, images, samples=samples, seed=seed)
         images[f"reference_{effect}"] = value

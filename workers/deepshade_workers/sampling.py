@@ -8,6 +8,7 @@ via the Tiny Encryption Algorithm", HPG 2010), so neighbours share no pattern.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -54,3 +55,39 @@ def rays_used(samples: int) -> int:
     """How many rays a pixel a reference with `samples` asked for really takes."""
     columns, rows = strata(samples)
     return 2 * columns * rows
+
+
+@dr.syntax
+def stratified_mean(
+    sample: Callable[[Any, Any, Any], Any], pixels: int, samples: int, seed: int
+) -> tuple[Any, Any]:
+    """Mean and standard error (Color3f each) of `sample(point, first, second)` for each pixel.
+
+    The three are pairs in [0, 1)²: `point` has two jittered samples in each stratum of the square,
+    about `samples` in all (`rays_used`), and the others are free. Each pair's difference gives an
+    unbiased variance of its stratum's mean, hence of the whole, whatever else is random.
+    """
+    columns, rows = strata(samples)
+    total = 2 * columns * rows
+    stream = pixel_streams(pixels, seed)
+    wide = dr.opaque(mi.UInt32, columns)
+    count = dr.opaque(mi.UInt32, total)
+    size = mi.Point2f(mi.Float(wide), mi.Float(dr.opaque(mi.UInt32, rows)))
+
+    index = mi.UInt32(0)
+    mean = mi.Color3f(0)
+    squares = mi.Color3f(0)
+    before = mi.Color3f(0)
+    while index < count:
+        cell = index // 2
+        corner = mi.Point2f(mi.Float(cell % wide), mi.Float(cell // wide))
+        point = (corner + random_pair(stream, 3 * index)) / size
+        value = sample(
+            point, random_pair(stream, 3 * index + 1), random_pair(stream, 3 * index + 2)
+        )
+        mean += value
+        difference = dr.select((index & 1) == 1, value - before, 0)
+        squares += difference * difference
+        before = value
+        index += 1
+    return mean / total, dr.sqrt(squares) / total

@@ -11,7 +11,7 @@ import numpy as np
 from deepshade.camera import Camera, rotation_of
 from deepshade_workers.backend import mitsuba
 from deepshade_workers.scenes.scene import Scene
-from deepshade_workers.view import Image
+from deepshade_workers.view import Image, View
 
 mi = mitsuba()
 
@@ -49,21 +49,43 @@ def trace(scene: Scene, camera: Camera, width: int, height: int) -> Hits:
     local = camera.rays(width, height).reshape(3, -1).astype(np.float64)
     length = np.linalg.norm(local, axis=0)
     world = rotation_of(camera.matrix).T @ (local / length)
-    eye = camera.eye
     ray = mi.Ray3f(
-        mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in eye)),
+        eye_of(camera),
         mi.Vector3f(*(mi.Float(row.astype(np.float32)) for row in world)),
     )
     si = scene.traced.ray_intersect(ray)
     valid = si.is_valid()
     back = valid & (dr.dot(si.n, ray.d) > 0)
-    # Both normals face the camera: surfaces have no inside for a G-buffer.
-    ng = dr.select(back, -si.n, si.n)
-    shading = si.sh_frame.n
-    ns = dr.select(dr.dot(shading, ng) < 0, -shading, shading)
+    ng, ns = normals_toward(si, ray)
     depth = si.t / mi.Float(length.astype(np.float32))
     dr.eval(si, valid, ng, ns, depth, back)
     return Hits(width, height, valid, si.p, ng, ns, depth, back, si)
+
+
+def eye_of(camera: Camera) -> Any:
+    """The camera's place in world space."""
+    return mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.eye))
+
+
+def pixel_rays(camera: Camera, width: int, height: int) -> Any:
+    """Camera-space directions with z = -1 through the centres of the window's pixels, row-major."""
+    return mi.Vector3f(*(mi.Float(row) for row in camera.rays(width, height).reshape(3, -1)))
+
+
+def turn_to_world(camera: Camera, vector: Any) -> Any:
+    """A camera-space `vector` in world space."""
+    x, y, z = (
+        mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in axis))
+        for axis in rotation_of(camera.matrix)
+    )
+    return x * vector.x + y * vector.y + z * vector.z
+
+
+def normals_toward(surface: Any, ray: Any) -> tuple[Any, Any]:
+    """Geometric and shading normal on the side that `ray` came from: surfaces have no inside."""
+    ng = dr.select(dr.dot(surface.n, ray.d) > 0, -surface.n, surface.n)
+    shading = surface.sh_frame.n
+    return ng, dr.select(dr.dot(shading, ng) < 0, -shading, shading)
 
 
 def offset_origin(point: Any, normal: Any, scene: Scene) -> Any:
@@ -73,8 +95,8 @@ def offset_origin(point: Any, normal: Any, scene: Scene) -> Any:
     return dr.fma(normal, magnitude * ORIGIN_OFFSET, point)
 
 
-def material(scene: Scene, surface: Any, valid: Any, name: str, channels: int) -> Any:
-    """A Phong term or the "object" number at interactions with a scene: 1 or 3 channels.
+def material(scene: Scene, view: View, surface: Any, valid: Any, name: str, channels: int) -> Any:
+    """A Phong term or the "object" number at interactions with a view's scene: 1 or 3 channels.
 
     `surface` is Mitsuba's interaction, `valid` where there is one. Our meshes carry the values per
     face. A Mitsuba XML scene's shapes tell only their diffuse reflectance; all else is 0.

@@ -22,7 +22,7 @@ SKY_RADIANCE = 0.35
 MATERIAL_CHANNELS = {"diffuse": (0, 3), "specular": (3, 6), "gloss": (6, 7), "scatter": (7, 10)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A Mitsuba scene with its name and bounds (2, 3) in scene units.
 
