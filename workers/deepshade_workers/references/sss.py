@@ -214,7 +214,8 @@ def over_outline(away: Any, u: Any, v: Any, path: Any) -> Any:
             stretch = dr.cosh(dr.lerp(low, high, (node + 1) / 2))
             r = dr.sqrt(dr.square(distance * stretch) + dr.square(height))
             part += weight * (within(r, path) - below) / stretch
-        total += part * dr.sign(signed) * (high - low) / 2
+        part *= (high - low) / 2
+        total += dr.select(signed < 0, -part, part)
     return total * dr.inv_two_pi
 
 
