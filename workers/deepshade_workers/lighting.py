@@ -123,7 +123,11 @@ def seen_along(scene: Scene, view: View, ray: Any, first: Any, second: Any) -> A
 
     `first` and `second` are as for `leaving`. The seen side of a surface is the ray's.
     """
-    surface = scene.traced.ray_intersect(ray)
+    return seen_at(scene, view, ray, scene.traced.ray_intersect(ray), first, second)
+
+
+def seen_at(scene: Scene, view: View, ray: Any, surface: Any, first: Any, second: Any) -> Any:
+    """`seen_along` of a `ray` that meets `surface`, which may have moved since."""
     valid = surface.is_valid()
     ng, ns = normals_toward(surface, ray)
     toward = dr.normalize(eye_of(view.camera) - surface.p)

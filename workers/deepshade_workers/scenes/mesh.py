@@ -94,6 +94,10 @@ class Mesh:
         moved = replace(self, vertices=vertices, normals=normals)
         return moved.flipped() if np.linalg.det(linear) < 0 else moved
 
+    def part(self, keep: NDArray[np.bool_]) -> Mesh:
+        """The faces of which `keep` (F,) says so, of no object."""
+        return Mesh(self.vertices, self.faces[keep], self.normals[keep], self.materials[keep])
+
     def flipped(self) -> Mesh:
         """The same triangles with their corners in the other order, and so facing the other way."""
         return replace(self, faces=self.faces[:, ::-1], normals=self.normals[:, ::-1])

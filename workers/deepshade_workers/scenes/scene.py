@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from deepshade.errors import SceneError, nearest
 from deepshade_workers.backend import mitsuba
-from deepshade_workers.scenes.mesh import Floats, Mesh, Object
+from deepshade_workers.scenes.mesh import Floats, Ints, Mesh, Object
 from deepshade_workers.view import Vector
 
 # A distant sun and a dim sky: what lights a scene that brings no lights of its own.
@@ -29,6 +29,7 @@ class Scene:
     `lit` tells whether the scene brings lights of its own. `objects` are what may move, with their
     faces in the one mesh that is traced; its face attribute "object" holds an object's number at a
     hit. A Mitsuba XML scene tells none.
+    Its `mesh` is kept, for what moves is traced by itself; None for an XML scene.
     `points` (n, 3) are places worth looking at, `extent` the size of the region they cover:
     a town on a wide plain is as large as the town.
     """
@@ -40,6 +41,7 @@ class Scene:
     extent: float
     lit: bool = False
     objects: tuple[Object, ...] = ()
+    mesh: Mesh | None = field(default=None, repr=False)
 
     @property
     def diagonal(self) -> float:
@@ -63,13 +65,37 @@ class Scene:
                 )
         return np.array([by_name.get(name, (0, 0, 0)) for name in names], np.float64)
 
+    def moving_parts(self, by_name: Mapping[str, Vector]) -> list[tuple[Any, Vector]]:
+        """What moves alike, as Mitsuba scenes without lights, each with its displacement.
+
+        Materials are those of this scene, and so are the numbers of objects.
+
+        Raises:
+            SceneError: no object has one of the names.
+        """
+        table = self.displacements(by_name)
+        if self.mesh is None or not table.any():
+            return [(self.traced, (0.0, 0.0, 0.0))]
+        mi = mitsuba()
+        numbers = _object_numbers(self.mesh)
+        moves, group = np.unique(table, axis=0, return_inverse=True)
+        parts: list[tuple[Any, Vector]] = []
+        for index, (x, y, z) in enumerate(moves.tolist()):
+            keep = group.reshape(-1)[numbers] == index
+            if keep.any():
+                shape = _shape(mi, self.name, self.mesh.part(keep), numbers[keep])
+                # Scenes that one CUDA kernel traces share the shader table of their parent.
+                shared = {"type": "scene", "parent": self.traced, "mesh": shape}
+                parts.append((mi.load_dict(shared), (x, y, z)))
+        return parts
+
     @classmethod
     def from_mesh(cls, name: str, mesh: Mesh) -> Scene:
         """Build the acceleration structure of one merged mesh, lit by the default sun and sky."""
         if not len(mesh.faces):
             raise SceneError(f"scene {name!r} holds no triangles")
         mi = mitsuba()
-        shape = _shape(mi, name, mesh)
+        shape = _shape(mi, name, mesh, _object_numbers(mesh))
         lights = {
             "sun": {
                 "type": "directional",
@@ -84,7 +110,7 @@ class Scene:
         # Where the triangles are small there is something to see; large ones are floors.
         points = mesh.vertices[mesh.faces[:: max(1, len(mesh.faces) // 4096)]].mean(1)
         objects = mesh.objects or (Object(name, 0, len(mesh.faces)),)
-        return cls(name, traced, bounds, points, _spread(points), objects=objects)
+        return cls(name, traced, bounds, points, _spread(points), objects=objects, mesh=mesh)
 
     @classmethod
     def from_xml(cls, path: Path) -> Scene:
@@ -109,8 +135,17 @@ def _spread(points: Floats) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def _shape(mi: Any, name: str, mesh: Mesh) -> Any:
-    """One Mitsuba mesh: corners are split so that each carries its own normal."""
+def _object_numbers(mesh: Mesh) -> Ints:
+    """(F,) the number of the object that each face belongs to."""
+    faces = [item.stop - item.start for item in mesh.objects] or [len(mesh.faces)]
+    return np.repeat(np.arange(len(faces)), faces)
+
+
+def _shape(mi: Any, name: str, mesh: Mesh, numbers: Ints) -> Any:
+    """One Mitsuba mesh: corners are split so that each carries its own normal.
+
+    `numbers` (F,) are those of the faces' objects.
+    """
     corners = mesh.vertices[mesh.faces].reshape(-1, 3).astype(np.float32)
     count = len(mesh.faces)
     props = mi.Properties()
@@ -120,9 +155,7 @@ def _shape(mi: Any, name: str, mesh: Mesh) -> Any:
         values = np.ascontiguousarray(mesh.materials[:, start:stop], np.float32)
         shape.add_attribute(f"face_{channel}", stop - start, values.ravel())
     # Numbers up to 2^24 are exact in float32.
-    faces = [item.stop - item.start for item in mesh.objects] or [count]
-    numbers = np.repeat(np.arange(len(faces), dtype=np.float32), faces)
-    shape.add_attribute("face_object", 1, numbers)
+    shape.add_attribute("face_object", 1, numbers.astype(np.float32))
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(corners.ravel())
     params["vertex_normals"] = mi.Float(mesh.normals.astype(np.float32).ravel())
