@@ -64,19 +64,21 @@ class Look:
             rng.random(count) < PLAIN_SHARE, len(textures), rng.integers(len(textures), size=count)
         )
         tint, specular, gloss = _phong(rng, layer == len(textures))
-        repeats = 1 / (record.length * np.exp(rng.uniform(*np.log(REPEATS), count)))
-        turns = np.where(rng.random(count) < 0.7, rng.integers(4, size=count), rng.uniform(0, 4, count))
+        repeats = 1 / (record.length * np.exp(rng.uniform(np.log(REPEATS[0]), np.log(REPEATS[1]), count)))
+        turns = np.where(
+            rng.random(count) < 0.7, rng.integers(4, size=count), rng.uniform(0, 4, count)
+        )
         across = repeats * np.stack([np.cos(turns * np.pi / 2), np.sin(turns * np.pi / 2)])
         offset = rng.random((2, count))
         scatter = np.zeros((3, count))
         for number, item in enumerate(scene.objects):
             scatter[:, number] = record.scatter.get(item.name, (0.0, 0.0, 0.0))
         forward = -rotation_of(camera.matrix)[2]
-        look = cls(
+        return cls(
             record,
             mi.Float(np.concatenate([_levels(texture) for texture in textures])),
             mi.UInt32(layer.astype(np.uint32)),
-            *(mi.Color3f(values.astype(np.float32)) for values in (tint,)),
+            mi.Color3f(tint.astype(np.float32)),
             mi.Vector2f(across.astype(np.float32)),
             mi.Vector2f(offset.astype(np.float32)),
             mi.Color3f(specular.astype(np.float32)),
@@ -86,7 +88,6 @@ class Look:
             mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in forward)),
             dr.opaque(mi.Float, 1 / camera.pixels_per_unit),
         )
-        return look
 
     def term(self, surface: Any, number: Any, valid: Any, name: str) -> Any:
         """The term `name` (Color3f, gloss Float) at interactions with objects `number` (UInt32)."""

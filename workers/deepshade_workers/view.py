@@ -39,6 +39,20 @@ class Light:
 
 
 @dataclass(frozen=True)
+class Limits:
+    """How much `drawing.dress` may draw for a view, in pixels.
+
+    The largest diameter of blur circles (of all but one pixel in twenty), the largest motion and
+    scattering mean free path, and the folder of the pictures that textures are taken from.
+    """
+
+    max_blur: float = 48.0
+    max_motion: float = 64.0
+    max_scatter: float = 64.0
+    textures: str | None = None
+
+
+@dataclass(frozen=True)
 class LookRecord:
     """What a look is drawn from (`look.Look`): the same record, the same look.
 

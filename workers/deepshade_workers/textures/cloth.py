@@ -90,7 +90,9 @@ def zigzag(rng: Rng, size: int) -> Field:
     bends, bands = int(rng.integers(2, 10)), int(rng.integers(3, 12))
     wave = v * bands + rng.uniform(0.3, 1) * np.abs(u * bends % 1 - 0.5) * 2
     palette = any_colours(rng, 2)
-    return _threads(rng, size, mix(palette[0], palette[1], steps(np.abs(wave % 1 - 0.5), 0.22, 0.28)))
+    return _threads(
+        rng, size, mix(palette[0], palette[1], steps(np.abs(wave % 1 - 0.5), 0.22, 0.28))
+    )
 
 
 def scales(rng: Rng, size: int) -> Field:

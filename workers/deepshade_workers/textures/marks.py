@@ -27,7 +27,9 @@ def script(rng: Rng, size: int) -> Field:
     text = rng.integers(20, size=(lines, columns))
     blank = rng.random((lines, columns)) < 0.18
     page = np.zeros((lines, 8, columns, 5), bool)
-    page[:, 1:6, :, :4] = np.where(blank[..., None, None], False, glyphs[text]).transpose(0, 2, 1, 3)
+    page[:, 1:6, :, :4] = np.where(blank[..., None, None], False, glyphs[text]).transpose(
+        0, 2, 1, 3
+    )
     small = page.reshape(lines * 8, columns * 5)
     index = (np.arange(size) * len(small)) // size, (np.arange(size) * small.shape[1]) // size
     ink, paper = colours(rng, 2)
@@ -88,7 +90,7 @@ def targets(rng: Rng, size: int) -> Field:
     """Rings about scattered centres."""
     first, _, number = cells(rng, size, int(rng.integers(2, 5)), 0.5)
     rings = np.floor(first * rng.uniform(4, 12) + number * 3) % 3
-    return any_colours(rng, 3)[rings.astype(int)]
+    return np.asarray(any_colours(rng, 3)[rings.astype(int)])
 
 
 def static(rng: Rng, size: int) -> Field:
@@ -101,5 +103,9 @@ def static(rng: Rng, size: int) -> Field:
 
 def smears(rng: Rng, size: int) -> Field:
     """Broad brush strokes."""
-    field = clouds(rng, size, 2, 1.6, (1, 6)) if rng.random() < 0.5 else clouds(rng, size, 2, 1.6, (6, 1))
+    field = (
+        clouds(rng, size, 2, 1.6, (1, 6))
+        if rng.random() < 0.5
+        else clouds(rng, size, 2, 1.6, (6, 1))
+    )
     return shade(field, any_colours(rng, 4))

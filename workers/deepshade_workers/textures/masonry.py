@@ -53,7 +53,7 @@ def checker(rng: Rng, size: int) -> Field:
     odd = ((u * count).astype(int) + (v * count).astype(int)) % 2
     two = any_colours(rng, 2)
     worn = 0.85 + 0.15 * clouds(rng, size, 2, 1.5)
-    return two[odd] * worn[..., None]
+    return np.asarray(two[odd] * worn[..., None])
 
 
 def hexagons(rng: Rng, size: int) -> Field:

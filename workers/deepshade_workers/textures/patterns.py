@@ -85,9 +85,7 @@ def rows(
     return (0.5 - dx) * lines / columns, 0.5 - dy, number
 
 
-def strokes(
-    rng: Rng, size: int, count: int, length: float, angle: float, spread: float
-) -> Field:
+def strokes(rng: Rng, size: int, count: int, length: float, angle: float, spread: float) -> Field:
     """How brightly the last of `count` thin lines is drawn at each texel, 0 where there is none.
 
     Their lengths are up to `length` of the side, their angles `angle` ± `spread` radians.
@@ -110,7 +108,7 @@ def warped(field: Field, du: Field, dv: Field) -> Field:
     index = np.arange(size)
     column = (index[None] + np.rint(du * size).astype(int)) % size
     row = (index[:, None] + np.rint(dv * size).astype(int)) % size
-    return field[row, column]
+    return np.asarray(field[row, column])
 
 
 def colours(rng: Rng, count: int, spread: float = 0.25) -> Field:
@@ -122,7 +120,9 @@ def colours(rng: Rng, count: int, spread: float = 0.25) -> Field:
 
 def any_colours(rng: Rng, count: int) -> Field:
     """(count, 3) unrelated linear reflectances."""
-    return rng.uniform(0.1, 0.9, (count, 1)) * (1 - rng.uniform(0, 0.9, (count, 1)) * rng.random((count, 3)))
+    return rng.uniform(0.1, 0.9, (count, 1)) * (
+        1 - rng.uniform(0, 0.9, (count, 1)) * rng.random((count, 3))
+    )
 
 
 def shade(field: Field, palette: Field) -> Field:
