@@ -1,4 +1,4 @@
-"""What a data set draws for a view beside its camera: light, lens, motions and a look.
+"""Light, lens, motions and a look, drawn for a view of a data set.
 
 The ranges are those that users will set, in pixels of the picture. What is drawn depends on what a
 coarse picture of the view shows, so every draw is recorded (`records`), not only its seed.
@@ -29,9 +29,10 @@ Rng = np.random.Generator
 OWN_SHARE = 0.3
 # The lamp's place: tries, and its distance from a visible point by the median depth.
 LAMPS = 8
-LAMP_DISTANCES = (0.2, 3.0)
+LAMP_DISTANCES = (0.3, 3.0)
 # Irradiance (median over what the lamp lights) and the sky's radiance.
 IRRADIANCES = (0.5, 4.0)
+HOTSPOT = 5.0  # what is nearest to the lamp gets at most about so many times that
 SKIES = (0.02, 1.5)
 DARK_SKIES = 0.12  # the share of views whose sky is nearly black
 LEAST_PIXELS = 2.0  # of the blur and of motions that there are
@@ -56,10 +57,10 @@ def dress(scene: Scene, view: View, hits: Hits, rng: Rng, limits: Limits) -> Vie
     )
     light = _light(rng, scene, hits, median)
     seed = int(rng.integers(2**63))
-    own = rng.random() < OWN_SHARE or not scene.objects
+    own = bool(rng.random() < OWN_SHARE)
     nearest = {name: float(np.median(found)) for name, found in depths.items()}
     scatter = scattering(rng, nearest, view.camera.pixels_per_unit, limits.max_scatter)
-    record = LookRecord(seed, median, limits.textures, scatter)
+    record = LookRecord(seed, median, limits.textures, scatter, own)
     return replace(
         view,
         focus=focus,
@@ -67,7 +68,7 @@ def dress(scene: Scene, view: View, hits: Hits, rng: Rng, limits: Limits) -> Vie
         shutter=1.0,
         displacements=moving,
         light=light,
-        look=None if own else Look.draw(scene, view.camera, record),
+        look=Look.draw(scene, view.camera, record) if scene.objects else None,
     )
 
 
@@ -162,7 +163,10 @@ def _light(rng: Rng, scene: Scene, hits: Hits, median: float) -> Light:
     """A lamp that lights something visible, and a sky."""
     position, cosines, clear = _lamp_place(rng, scene, hits, median)
     # Surfaces that it lights receive cosine / distance² times its intensity.
-    typical = float(np.median(cosines)) if len(cosines) else 1 / median**2
+    typical = 1 / median**2
+    if len(cosines):
+        middle, near = np.percentile(cosines, [50, 95])
+        typical = float(max(middle, near / HOTSPOT))
     strength = _uniform_log(rng, *IRRADIANCES) / typical
     size = 0.0 if rng.random() < 0.4 else min(_uniform_log(rng, 0.005, 0.1) * median, clear / 2)
     x, y, z = position.tolist()
@@ -178,7 +182,7 @@ def _light(rng: Rng, scene: Scene, hits: Hits, median: float) -> Light:
 
 def _coloured(rng: Rng, brightness: float) -> Vector:
     """`brightness` times a pale colour whose largest channel is 1; mostly warm or cool."""
-    warmth, tint = rng.uniform(-0.35, 0.35), rng.uniform(-0.08, 0.08)
+    warmth, tint = rng.uniform(-0.25, 0.25), rng.uniform(-0.06, 0.06)
     colour = np.array([1 + warmth, 1 + tint, 1 - warmth])
     r, g, b = (brightness * colour / colour.max()).tolist()
     return r, g, b
@@ -199,7 +203,9 @@ def _lamp_place(rng: Rng, scene: Scene, hits: Hits, median: float) -> tuple[Floa
     ways /= np.linalg.norm(ways, axis=0)
     origin = offset_origin(_points(start), _vectors(side), scene)
     free = scene.traced.ray_intersect_preliminary(mi.Ray3f(origin, _vectors(ways))).t.numpy()
-    wanted = median * np.exp(rng.uniform(np.log(LAMP_DISTANCES[0]), np.log(LAMP_DISTANCES[1]), LAMPS))
+    wanted = median * np.exp(
+        rng.uniform(np.log(LAMP_DISTANCES[0]), np.log(LAMP_DISTANCES[1]), LAMPS)
+    )
     places = start + ways * np.minimum(wanted, 0.7 * free)
     count = points.shape[1]
     tries = np.repeat(places, count, 1)

@@ -43,7 +43,7 @@ class Look:
 
     record: LookRecord
     texels: Any  # every texture's levels, one after the other, the finest first
-    layer: Any  # the object's texture; the number of textures where it is plain
+    layer: Any  # the object's texture; `TEXTURES` where it is plain
     tint: Any
     across: Any  # the texture's u axis in the side's plane, repeats a unit: (cos, sin) · repeats
     offset: Any
@@ -58,13 +58,14 @@ class Look:
     def draw(cls, scene: Scene, camera: Camera, record: LookRecord) -> Look:
         """The look that `record` stands for, of the objects of `scene` seen by `camera`."""
         rng = np.random.default_rng(record.seed)
-        textures = draw_textures(rng, TEXTURES, record.textures)
+        textures = [] if record.own else draw_textures(rng, TEXTURES, record.textures)
         count = max(1, len(scene.objects))
-        layer = np.where(
-            rng.random(count) < PLAIN_SHARE, len(textures), rng.integers(len(textures), size=count)
+        plain = rng.random(count) < PLAIN_SHARE
+        layer = np.where(plain, TEXTURES, rng.integers(TEXTURES, size=count))
+        tint, specular, gloss = _phong(rng, plain)
+        repeats = 1 / (
+            record.length * np.exp(rng.uniform(np.log(REPEATS[0]), np.log(REPEATS[1]), count))
         )
-        tint, specular, gloss = _phong(rng, layer == len(textures))
-        repeats = 1 / (record.length * np.exp(rng.uniform(np.log(REPEATS[0]), np.log(REPEATS[1]), count)))
         turns = np.where(
             rng.random(count) < 0.7, rng.integers(4, size=count), rng.uniform(0, 4, count)
         )
@@ -76,7 +77,7 @@ class Look:
         forward = -rotation_of(camera.matrix)[2]
         return cls(
             record,
-            mi.Float(np.concatenate([_levels(texture) for texture in textures])),
+            mi.Float(np.concatenate([np.zeros(0, np.float32), *map(_levels, textures)])),
             mi.UInt32(layer.astype(np.uint32)),
             mi.Color3f(tint.astype(np.float32)),
             mi.Vector2f(across.astype(np.float32)),
@@ -87,6 +88,12 @@ class Look:
             mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.eye)),
             mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in forward)),
             dr.opaque(mi.Float, 1 / camera.pixels_per_unit),
+        )
+
+    def holds(self, name: str) -> bool:
+        """Whether the look has the term `name`, in place of the scene's own."""
+        return name == "scatter" or (
+            name in ("diffuse", "specular", "gloss") and not self.record.own
         )
 
     def term(self, surface: Any, number: Any, valid: Any, name: str) -> Any:

@@ -43,11 +43,13 @@ def record_of(view: View) -> dict[str, Any]:
 def view_of(record: Mapping[str, Any], scene: Scene) -> View:
     """The view of `scene` that `record_of` made `record` of."""
     seen: dict[str, Any] = record["camera"]
-    camera = Camera(seen["fov"], *seen["frame"], np.array(seen["world_to_camera"]), *seen["origin"])
+    (width, height), (x0, y0) = seen["frame"], seen["origin"]
+    camera = Camera(seen["fov"], width, height, np.array(seen["world_to_camera"]), x0, y0)
     light = record.get("light")
     look = record.get("look")
     if light is not None:
-        light = Light(**{k: v if k == "size" else _vector(v) for k, v in light.items()})
+        colours = {name: _vector(value) for name, value in light.items() if name != "size"}
+        light = Light(size=light["size"], **colours)
     if look is not None:
         scatter = {name: _vector(path) for name, path in look["scatter"].items()}
         look = Look.draw(scene, camera, LookRecord(**{**look, "scatter": scatter}))

@@ -103,7 +103,7 @@ def material(scene: Scene, view: View, surface: Any, valid: Any, name: str, chan
     reflectance; all else is 0.
     """
     shape = surface.shape
-    if view.look is not None and name != "object":
+    if view.look is not None and view.look.holds(name):
         number = mi.UInt32(shape.eval_attribute_1("face_object", surface, valid))
         return dr.select(valid, view.look.term(surface, number, valid, name), 0)
     key = f"face_{name}"

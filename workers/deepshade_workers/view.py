@@ -58,13 +58,14 @@ class LookRecord:
 
     `length` (scene units) is what textures are sized by, `textures` a folder of pictures that are
     used beside the generated ones. `scatter` holds mean free paths (RGB, scene units) by the names
-    of the objects that scatter.
+    of the objects that scatter. With `own` all else is the scene's own.
     """
 
     seed: int
     length: float
     textures: str | None = None
     scatter: Mapping[str, Vector] = field(default_factory=dict)
+    own: bool = False
 
 
 @dataclass(frozen=True)
