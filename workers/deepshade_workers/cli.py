@@ -7,9 +7,12 @@ import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from deepshade_workers.view import Light
 
 Vector = tuple[float, float, float]
 
@@ -19,7 +22,10 @@ MAX_SIDE = 16384  # pixels
 def render(
     scene: Annotated[
         str,
-        typer.Argument(help="OBJ, PLY, glTF, GLB, Mitsuba XML, or procedural:<family>:<seed>."),
+        typer.Argument(
+            help="OBJ, PLY, glTF, GLB, Mitsuba XML, procedural:<family>:<seed>, or "
+            "compose:<folders or files, + between>:<seed>."
+        ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="EXR file to write.")],
     eye: Annotated[Vector, typer.Option(help="The camera's place, scene units.")],
@@ -37,6 +43,22 @@ def render(
         float | None, typer.Option(help="Focus distance.  [default: that of the target]")
     ] = None,
     aperture: Annotated[float, typer.Option(help="Lens diameter, scene units.", min=0)] = 0.0,
+    lamp: Annotated[
+        Vector | None,
+        typer.Option(help="A lamp's place; it and --sky replace the scene's own lights."),
+    ] = None,
+    lamp_size: Annotated[float, typer.Option(help="Its radius; 0 is a point.", min=0)] = 0.0,
+    lamp_power: Annotated[
+        float | None,
+        typer.Option(help="Its radiant intensity.  [default: irradiance 2 on the target]", min=0),
+    ] = None,
+    sky: Annotated[
+        float | None, typer.Option(help="The sky's radiance.  [default: 0.3 with a lamp]", min=0)
+    ] = None,
+    move: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=X,Y,Z: how an object moves in the open shutter; repeatable."),
+    ] = None,
     attributes: Annotated[
         str, typer.Option(help="Attributes to write, commas between.  [default: all]")
     ] = "",
@@ -47,6 +69,9 @@ def render(
     Example:
 
       deepshade render teapot.obj -o out.exr --eye 0 3 6 --target 0 1 0 --radius 0.5
+
+      deepshade render room.gltf -o out.exr --eye 0 1.5 3 --target 0 1 0 --effects ao,gi \
+        --lamp 1 2.2 1 --lamp-size 0.1 --aperture 0.2 --move "chair=0.2,0,0"
     """
     import math
 
@@ -74,6 +99,9 @@ def render(
         radius=opened.diagonal / 20 if radius is None else radius,
         focus=math.dist(eye, target) if focus is None else focus,
         aperture=aperture,
+        shutter=1.0,
+        displacements=dict(_motion(text) for text in move or []),
+        light=_light(lamp, lamp_size, lamp_power, sky, target),
     )
     shown = chosen or list(ATTRIBUTES)
     figures = render_view(
@@ -89,6 +117,35 @@ def render(
             f"  {name}: mean {found['mean']}, contrast {found['contrast']}, "
             f"standard error {found['error']}"
         )
+
+
+def _motion(text: str) -> tuple[str, Vector]:
+    from deepshade.errors import ConfigError
+
+    name, _, values = text.rpartition("=")
+    try:
+        x, y, z = (float(value) for value in values.split(","))
+    except ValueError:
+        name = ""
+    if not name:
+        raise ConfigError("move", detail=f"--move {text!r} must be like 'chair=0.2,0,0'")
+    return name, (x, y, z)
+
+
+def _light(
+    lamp: Vector | None, size: float, power: float | None, sky: float | None, target: Vector
+) -> Light | None:
+    """The view's own light; None where neither lamp nor sky is asked for."""
+    import math
+
+    from deepshade_workers.view import Light
+
+    if lamp is None and sky is None:
+        return None
+    if power is None:
+        power = 0.0 if lamp is None else 2 * math.dist(lamp, target) ** 2
+    bright = 0.3 if sky is None else sky
+    return Light(lamp or target, size, (power,) * 3, *[(bright,) * 3] * 3)
 
 
 def _listed(text: str) -> list[str]:
@@ -110,7 +167,10 @@ def datagen(
     out: Annotated[Path, typer.Option(help="Folder of the data set; an unfinished one goes on.")],
     scenes: Annotated[
         list[str],
-        typer.Option(help="Scene file, folder, 'procedural' or 'procedural:<family>'; repeatable."),
+        typer.Option(
+            help="Scene file, folder, 'procedural', 'procedural:<family>' or 'compose:<folders or "
+            "files, + between>'; repeatable."
+        ),
     ],
     views: Annotated[int, typer.Option(help="Samples in all.", min=1)] = 256,
     size: Annotated[int, typer.Option(help="Side of a sample, pixels.", min=8, max=4096)] = 256,
@@ -120,13 +180,23 @@ def datagen(
     ] = None,
     spp: Annotated[int, typer.Option(help="Reference rays a pixel.", min=2)] = 256,
     seed: Annotated[int, typer.Option(min=0)] = 0,
-    effects: Annotated[list[str] | None, typer.Option(help="Effects; repeatable.")] = None,
+    effects: Annotated[
+        list[str] | None, typer.Option(help="Effects, commas between; repeatable.")
+    ] = None,
     radius: Annotated[
         float | None, typer.Option(help="Effect radius, scene units.  [default: drawn per view]")
     ] = None,
     min_contrast: Annotated[
         float, typer.Option(help="Least standard deviation of a view's occlusion.")
     ] = 0.06,
+    max_blur: Annotated[float, typer.Option(help="Largest blur circles drawn, pixels.")] = 48.0,
+    max_motion: Annotated[float, typer.Option(help="Largest motions drawn, pixels.")] = 64.0,
+    max_scatter: Annotated[
+        float, typer.Option(help="Largest scattering mean free paths drawn, pixels.")
+    ] = 64.0,
+    textures: Annotated[
+        Path | None, typer.Option(help="Folder of pictures for textures, beside generated ones.")
+    ] = None,
     shard_size: Annotated[int, typer.Option(help="Samples in a shard.", min=1)] = 128,
     address: Annotated[
         str | None, typer.Option(help="A running Ray cluster.  [default: one of its own]")
@@ -135,9 +205,13 @@ def datagen(
 ) -> None:
     """Render a data set of random views on Ray.
 
-    Run the same command again to go on after an interruption. Examples:
+    Run the same command again to go on after an interruption. Where an effect sees light or
+    materials, they, the lens and motions are drawn for each view. Examples:
 
       deepshade datagen --out data/ao --scenes procedural --views 2048
+
+      deepshade datagen --out data/light --scenes procedural --scenes compose:furniture+plants \
+        --effects ao,gi --textures pictures --views 2048
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
@@ -146,7 +220,7 @@ def datagen(
     spec = DataSpec(
         scenes=expand_scenes(scenes),
         views=views,
-        effects=tuple(effects or ["ao"]),
+        effects=tuple(name for text in effects or ["ao"] for name in _listed(text)),
         size=size,
         frame=frame or size,
         spp=spp,
@@ -154,6 +228,10 @@ def datagen(
         radius=radius,
         min_contrast=min_contrast,
         shard_size=shard_size,
+        max_blur=max_blur,
+        max_motion=max_motion,
+        max_scatter=max_scatter,
+        textures=None if textures is None else str(textures),
     )
     begun = time.monotonic()
     done, fresh = _watched(generate(spec, out, address=address), hidden=as_json)

@@ -14,25 +14,38 @@ from typing import Any, cast
 
 import numpy as np
 
+from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import NAME, Manifest, Shard
 from deepshade_workers.references import require
-from deepshade_workers.scenes.loading import PROCEDURAL, SUFFIXES, parse_procedural
+from deepshade_workers.scenes.loading import (
+    COMPOSED,
+    PROCEDURAL,
+    SUFFIXES,
+    is_unseeded,
+    parse_composed,
+    parse_procedural,
+)
 from deepshade_workers.scenes.procedural import FAMILIES
 from deepshade_workers.shards import schema, shard_name, write_shard
-from deepshade_workers.view import Images, Vector
+from deepshade_workers.view import Images, Limits, Vector
 
 # How often a sample whose scene shows nothing useful may ask for another scene.
 SCENE_TRIES = 16
+# Attributes that the camera and the scene's shape alone decide.
+GEOMETRY = {"position", "normal", "normal_world", "depth", "view", "view_angle"}
 
 
 @dataclass(frozen=True)
 class DataSpec:
     """What a data set holds; two equal ones make equal bytes.
 
-    `scenes` are files, or `procedural:<family>`; `size` is a sample's side and `frame` that of
-    the view it is cut from, in pixels; `radius` None draws one for each view.
+    `scenes` are files, `procedural:<family>` or `compose:<parts>`; `size` is a sample's side and
+    `frame` that of the view it is cut from, in pixels; `radius` None draws one for each view.
+    Effects that see more than places and normals have light, lens, motions and materials drawn for
+    each view, up to `max_blur`, `max_motion` and `max_scatter` pixels (`view.Limits`), with
+    pictures from the folder `textures` among their textures.
     """
 
     scenes: tuple[str, ...]
@@ -45,6 +58,10 @@ class DataSpec:
     radius: float | None = None
     min_contrast: float = 0.06
     shard_size: int = 128
+    max_blur: float = Limits.max_blur
+    max_motion: float = Limits.max_motion
+    max_scatter: float = Limits.max_scatter
+    textures: str | None = None
 
     def __post_init__(self) -> None:
         least = {"views": 1, "size": 1, "frame": self.size, "spp": 1, "seed": 0, "shard_size": 1}
@@ -54,6 +71,12 @@ class DataSpec:
                 raise ConfigError(key, detail=f"{key} must be at least {low}, not {value}")
         if self.radius is not None and not (math.isfinite(self.radius) and self.radius > 0):
             raise ConfigError("radius", detail=f"the radius must be above 0, not {self.radius}")
+        for key in ("max_blur", "max_motion", "max_scatter"):
+            value = getattr(self, key)
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(key, detail=f"{key} must be above 0 pixels, not {value}")
+        if not self.effects:
+            raise ConfigError("effects", detail="no effects were given: --effects ao, say")
         require(self.effects)
         if not self.scenes:
             raise ConfigError("scenes", detail="no scenes were given: --scenes procedural, say")
@@ -66,6 +89,14 @@ class DataSpec:
     def samples(self, shard: int) -> range:
         """The sample numbers of a shard."""
         return range(shard * self.shard_size, min(self.views, (shard + 1) * self.shard_size))
+
+    @property
+    def limits(self) -> Limits | None:
+        """What views draw beside the camera; None where no effect would see it."""
+        seen = {name for effect in self.effects for name in EFFECTS[effect].inputs}
+        if seen <= GEOMETRY:
+            return None
+        return Limits(self.max_blur, self.max_motion, self.max_scatter, self.textures)
 
     def settings(self) -> dict[str, Any]:
         """JSON-ready settings, for the manifest."""
@@ -85,6 +116,9 @@ def expand_scenes(names: list[str]) -> tuple[str, ...]:
         elif name.startswith(f"{PROCEDURAL}:"):
             parse_procedural(name)
             found.append(name)
+        elif name.startswith(f"{COMPOSED}:"):
+            parse_composed(name)
+            found.append(name)
         elif Path(name).is_dir():
             inside = sorted(p for p in Path(name).iterdir() if p.suffix.lower() in SUFFIXES)
             if not inside:
@@ -95,7 +129,8 @@ def expand_scenes(names: list[str]) -> tuple[str, ...]:
         else:
             raise SceneError(
                 f"there is no scene {name!r}",
-                fix=f"give a file ({', '.join(sorted(SUFFIXES))}), a folder or 'procedural'",
+                fix=f"give a file ({', '.join(sorted(SUFFIXES))}), a folder, 'procedural' or "
+                "compose:FOLDER",
             )
     return tuple(found)
 
@@ -108,6 +143,7 @@ def make_sample(
     The sample's own random stream picks scene, view, radius and noise, so it doesn't matter
     which worker renders it, or when. `displacements` move the scene's objects (`view.View`).
     """
+    from deepshade_workers.records import record_of
     from deepshade_workers.render import render_sample
     from deepshade_workers.scenes.loading import open_scene
     from deepshade_workers.viewpoints import sample_view
@@ -115,7 +151,7 @@ def make_sample(
     rng = np.random.default_rng([spec.seed, index])
     choice = spec.scenes[index % len(spec.scenes)]
     for attempt in range(SCENE_TRIES):
-        fresh = choice.startswith(PROCEDURAL) and choice.count(":") == 1
+        fresh = is_unseeded(choice)
         name = f"{choice}:{int(rng.integers(2**31))}" if fresh else choice
         scene = open_scene(name)
         try:
@@ -127,6 +163,7 @@ def make_sample(
                 radius=spec.radius,
                 min_contrast=spec.min_contrast,
                 displacements=displacements,
+                limits=spec.limits,
             )
             break
         except SceneError:
@@ -138,20 +175,7 @@ def make_sample(
     images = render_sample(
         scene, view, spec.size, spec.size, effects=spec.effects, samples=spec.spp, seed=noise
     )
-    camera = view.camera
-    record: dict[str, Any] = {
-        "scene": name,
-        "seed": noise,
-        **view.settings(),
-        "camera": {
-            "fov": camera.fov,
-            "frame": [camera.width, camera.height],
-            "origin": [camera.x0, camera.y0],
-            "world_to_camera": camera.matrix.tolist(),
-        },
-    }
-    if view.displacements:
-        record["displacements"] = {key: list(value) for key, value in view.displacements.items()}
+    record = {"scene": name, "seed": noise, **record_of(view)}
     return images, record
 
 

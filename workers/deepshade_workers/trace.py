@@ -99,9 +99,13 @@ def material(scene: Scene, view: View, surface: Any, valid: Any, name: str, chan
     """A Phong term or the "object" number at interactions with a view's scene: 1 or 3 channels.
 
     `surface` is Mitsuba's interaction, `valid` where there is one. Our meshes carry the values per
-    face. A Mitsuba XML scene's shapes tell only their diffuse reflectance; all else is 0.
+    face, unless the view has a look. A Mitsuba XML scene's shapes tell only their diffuse
+    reflectance; all else is 0.
     """
     shape = surface.shape
+    if view.look is not None and view.look.holds(name):
+        number = mi.UInt32(shape.eval_attribute_1("face_object", surface, valid))
+        return dr.select(valid, view.look.term(surface, number, valid, name), 0)
     key = f"face_{name}"
     known = shape.has_attribute(key, valid)
     if channels == 1:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.camera import Camera
 from deepshade.effects import SETTINGS
+
+if TYPE_CHECKING:
+    from deepshade_workers.look import Look
 
 Vector = tuple[float, float, float]
 Image = NDArray[np.float32]  # planar: (C, H, W)
@@ -36,13 +39,44 @@ class Light:
 
 
 @dataclass(frozen=True)
+class Limits:
+    """How much `drawing.dress` may draw for a view, in pixels.
+
+    The largest diameter of blur circles (of all but one pixel in twenty), the largest motion and
+    scattering mean free path, and the folder of the pictures that textures are taken from.
+    """
+
+    max_blur: float = 48.0
+    max_motion: float = 64.0
+    max_scatter: float = 64.0
+    textures: str | None = None
+
+
+@dataclass(frozen=True)
+class LookRecord:
+    """What a look is drawn from (`look.Look`): the same record, the same look.
+
+    `length` (scene units) is what textures are sized by, `textures` a folder of pictures that are
+    used beside the generated ones. `scatter` holds mean free paths (RGB, scene units) by the names
+    of the objects that scatter. With `own` all else is the scene's own.
+    """
+
+    seed: int
+    length: float
+    textures: str | None = None
+    scatter: Mapping[str, Vector] = field(default_factory=dict)
+    own: bool = False
+
+
+@dataclass(frozen=True)
 class View:
     """A camera with the settings of what is seen through it; None where they aren't set.
 
     `radius`, `focus` (distance) and `aperture` (diameter) are in scene units, `shutter` in frames,
     `environment` is a map's name. `displacements` says by name how far objects of the scene move
     while the shutter is open, (x, y, z) in world space; the picture is of the middle of that time.
-    Without a `light` the scene's own lights, or its default ones, count.
+    Without a `light` the scene's own lights, or its default ones, count; without a `look` its own
+    materials.
     """
 
     camera: Camera
@@ -53,6 +87,7 @@ class View:
     environment: str | None = None
     displacements: Mapping[str, Vector] = field(default_factory=dict)
     light: Light | None = None
+    look: Look | None = field(default=None, compare=False)
 
     def settings(self) -> dict[str, float | str]:
         """The settings that are set, by their names in `deepshade.effects.SETTINGS`."""

@@ -9,10 +9,11 @@ import numpy as np
 
 from deepshade.camera import Camera
 from deepshade.errors import SceneError
+from deepshade_workers.drawing import dress
 from deepshade_workers.references import ao
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, trace
-from deepshade_workers.view import Vector, View
+from deepshade_workers.view import Limits, Vector, View
 
 FOV = 50.0
 PROBE = 48
@@ -32,6 +33,7 @@ def sample_view(
     radius: float | None = None,
     min_contrast: float = 0.06,
     displacements: Mapping[str, Vector] | None = None,
+    limits: Limits | None = None,
 ) -> View:
     """A random view: `size`² pixels out of a `frame`² one, at a random place of it.
 
@@ -39,6 +41,9 @@ def sample_view(
     that one surface fills the view, and those whose ambient occlusion varies by less than
     `min_contrast` (standard deviation), such as a bare wall. `radius` is drawn log-uniformly in
     `RADIUS_RANGE` times the median depth unless given. `displacements` become the view's.
+
+    With `limits` a light, a lens, motions and a look are drawn too (`drawing.dress`), from a
+    stream of their own: the view is the same without.
 
     Raises:
         SceneError: no such view turned up in `MAX_TRIES` tries.
@@ -58,7 +63,7 @@ def sample_view(
         view = View(camera, reach, displacements=displacements or {})
         visibility, _ = ao.reference(scene, view, hits, {}, samples=32, seed=seed)
         if float(visibility.std()) >= min_contrast:
-            return view
+            return view if limits is None else dress(scene, view, hits, rng.spawn(1)[0], limits)
     raise SceneError(
         f"no useful view of {scene.name} in {MAX_TRIES} tries",
         fix="check that its faces look outward and that its size suits --radius",

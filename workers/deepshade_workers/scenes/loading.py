@@ -1,4 +1,5 @@
-"""Opens scenes by name: mesh files, Mitsuba XML, and `procedural:<family>:<seed>`."""
+"""Opens scenes by name: mesh files, Mitsuba XML, `procedural:<family>:<seed>` and
+`compose:<parts>:<seed>`."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from deepshade.errors import SceneError, nearest
+from deepshade_workers.scenes.composition import compose, files_of
 from deepshade_workers.scenes.mesh import Material, Mesh, merge
 from deepshade_workers.scenes.procedural import FAMILIES, generate
 from deepshade_workers.scenes.scene import Scene
@@ -16,15 +18,22 @@ from deepshade_workers.scenes.scene import Scene
 MESH_SUFFIXES = {".obj", ".ply", ".gltf", ".glb", ".stl", ".off"}
 SUFFIXES = MESH_SUFFIXES | {".xml"}
 PROCEDURAL = "procedural"
+COMPOSED = "compose"
 
 
 @functools.lru_cache(maxsize=4)
 def open_scene(name: str) -> Scene:
-    """Open a scene file, or make the procedural scene `procedural:<family>:<seed>`.
+    """Open a scene file, or make `procedural:<family>:<seed>` or `compose:<parts>:<seed>`.
 
     Raises:
         SceneError: there is no such file or family, or it can't be read.
     """
+    if name.split(":")[0] == COMPOSED:
+        parts, seed = parse_composed(name)
+        if seed is None:
+            raise SceneError(f"{name!r} names no seed", fix=f"write {name}:1, say")
+        files = files_of(parts, frozenset(MESH_SUFFIXES))
+        return Scene.from_mesh(name, compose(parts, files, _kept, seed))
     if name.split(":")[0] == PROCEDURAL:
         family, seed = parse_procedural(name)
         if seed is None:
@@ -48,6 +57,24 @@ def parse_procedural(name: str) -> tuple[str, int | None]:
     if seed and not seed.isdecimal():
         raise SceneError(f"the seed in {name!r} must be a whole number, 0 or more")
     return family, int(seed) if seed else None
+
+
+def parse_composed(name: str) -> tuple[str, int | None]:
+    """Split `compose:<parts>[:<seed>]`; raises SceneError where no part holds a mesh file."""
+    rest = name.partition(":")[2]
+    parts, _, seed = rest.rpartition(":")
+    if not (parts and seed.isdecimal()):
+        parts, seed = rest, ""
+    files_of(parts, frozenset(MESH_SUFFIXES))
+    return parts, int(seed) if seed else None
+
+
+def is_unseeded(name: str) -> bool:
+    """Whether `name` stands for any scene of its kind, one for each seed."""
+    kind = name.split(":")[0]
+    if kind == COMPOSED:
+        return parse_composed(name)[1] is None
+    return kind == PROCEDURAL and parse_procedural(name)[1] is None
 
 
 def load_mesh(path: Path) -> Mesh:
@@ -74,6 +101,9 @@ def load_mesh(path: Path) -> Mesh:
     if not any(len(mesh.faces) for mesh in meshes.values()):
         raise SceneError(f"{path} holds no triangles")
     return merge(meshes.values(), list(meshes))
+
+
+_kept = functools.lru_cache(maxsize=256)(load_mesh)
 
 
 def _placed(scene: Any, node: str) -> Mesh | None:
