@@ -21,7 +21,7 @@ mi = mitsuba()
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
 class Grid:
-    """The size of a picture whose planes are flat, in row-major order; all but `shape` on device."""
+    """The size of a picture whose planes are flat, in row-major order."""
 
     shape: tuple[int, int]
     width: Any
