@@ -1,0 +1,102 @@
+"""Pictures on the device: what the rivals that gather light from around a pixel share.
+
+Each is a chain of functions that Dr.Jit compiles; within one, a pixel's whole loop runs in
+registers. On a machine with a GPU they run there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from deepshade_report.view import Float, View
+from deepshade_workers.backend import mitsuba
+
+mi = mitsuba()
+
+
+@dataclass  # not frozen: Dr.Jit writes a loop's state back
+class Grid:
+    """The size of a picture whose planes are flat, in row-major order."""
+
+    shape: tuple[int, int]
+    width: Any
+    height: Any
+
+    @staticmethod
+    def of(height: int, width: int) -> Grid:
+        """The grid of a picture. Its size is no constant of what is compiled for it."""
+        return Grid((height, width), dr.opaque(mi.Int32, width), dr.opaque(mi.Int32, height))
+
+    def pixels(self) -> tuple[Any, Any]:
+        """Column and row of every pixel."""
+        index = dr.arange(mi.Int32, self.shape[0] * self.shape[1])
+        row = index // self.width
+        return index - row * self.width, row
+
+    def at(self, column: Any, row: Any) -> Any:
+        """The index of a pixel, or of the nearest one in the picture."""
+        column = dr.clip(column, 0, self.width - 1)
+        return mi.UInt32(dr.clip(row, 0, self.height - 1) * self.width + column)
+
+
+def light(planes: Float) -> Any:
+    """(3, H, W) light on the device; what isn't finite is 0."""
+    return mi.Color3f(*(plain(plane) for plane in planes))
+
+
+def plain(plane: Float) -> Any:
+    """(H, W) on the device; what isn't finite is 0."""
+    return mi.Float(np.nan_to_num(plane, posinf=0.0, neginf=0.0).astype(np.float32).ravel())
+
+
+def downloaded(image: Any, shape: tuple[int, int]) -> Float:
+    """(3, H, W) of a colour on the device."""
+    result: Float = image.numpy().reshape(3, *shape)
+    return result
+
+
+def gradient_noise(column: Any, row: Any) -> Any:
+    """Interleaved gradient noise in [0, 1) (Jimenez 2014, "Next Generation Post Processing")."""
+    value = 52.9829189 * _fraction(0.06711056 * mi.Float(column) + 0.00583715 * mi.Float(row))
+    return _fraction(value)
+
+
+def _fraction(value: Any) -> Any:
+    return value - dr.floor(value)
+
+
+class Filter:
+    """A Method that carries light: `upload` puts a view on the device, `kernel` shades it.
+
+    The kernel is given what was uploaded, the settings' values and the parameters', and returns
+    the picture's colour on the device.
+    """
+
+    family = "screen-space"
+
+    def __init__(
+        self,
+        name: str,
+        settings: dict[str, Any],
+        parameters: Any,
+        upload: Callable[[View], Any],
+        kernel: Callable[..., Any],
+    ) -> None:
+        self.name, self.settings, self.parameters = name, settings, parameters
+        self._upload, self._kernel = upload, kernel
+        self._frame: Any = None
+        self._shape = (0, 0)
+
+    def prepare(self, view: View) -> None:
+        """Put the view on the device."""
+        self._frame, self._shape = self._upload(view), (view.height, view.width)
+
+    def shade(self, view: View) -> Float:
+        """(3, H, W) of the prepared view."""
+        values = [*self.settings.values(), *astuple(self.parameters)]
+        return downloaded(self._kernel(self._frame, *values), self._shape)
