@@ -92,7 +92,7 @@ def open_screen(view: View) -> Screen:
         dr.opaque(mi.Int32, width),
         dr.opaque(mi.Int32, height),
         mi.Float(np.where(there, depth, np.float32(0)).ravel()),
-        dr.normalize(mi.Vector3f(*(mi.Float(plane) for plane in planes))),
+        _unit(mi.Vector3f(*(mi.Float(plane) for plane in planes))),
         mi.Float(turn),
         mi.Float(offset),
         dr.opaque(mi.Float, camera.pixels_per_unit),
@@ -100,6 +100,11 @@ def open_screen(view: View) -> Screen:
     )
     dr.eval(screen.normal)
     return screen
+
+
+def _unit(vector: Any) -> Any:
+    """A direction, where there is one."""
+    return vector * dr.rcp(dr.maximum(dr.norm(vector), TINY))
 
 
 def jitter(column: NDArray[np.int64], row: NDArray[np.int64]) -> tuple[Float, Float]:
