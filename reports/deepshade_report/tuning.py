@@ -38,9 +38,13 @@ class Tunable:
 
 
 def tuned(package: str, name: str) -> dict[str, Any]:
-    """A baseline's parameters that a search found, by name, from its package's tuned.json."""
-    found = json.loads((files(package) / "tuned.json").read_text("utf-8"))
-    return dict(found[name]["parameters"])
+    """A baseline's parameters that a search found, by name, from its package's tuned.json.
+
+    None where no search has been made: those of the sources are left as they are.
+    """
+    source = files(package) / "tuned.json"
+    found = json.loads(source.read_text("utf-8")) if source.is_file() else {}
+    return dict(found.get(name, {}).get("parameters", {}))
 
 
 def tune(subject: Tunable, views: Sequence[View], seconds: float, seed: int) -> dict[str, Any]:

@@ -16,14 +16,15 @@ from deepshade_report.view import Float, View
 from .walls import cast, degenerate, groove, rubble
 
 try:
-    from deepshade_report.baselines.ao import gtao, hbao, screen
+    from deepshade_report.baselines import screen
+    from deepshade_report.baselines.ao import gtao, hbao, marching
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
     pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
 
 # nothing but the method: no fade before the radius, no bias, no blur
-PLAIN = screen.Parameters(radius=1.0, falloff=0.02, bias=0.0, spread=1.0, blur=0)
+PLAIN = marching.Parameters(radius=1.0, falloff=0.02, bias=0.0, spread=1.0, blur=0)
 BOTH = [(hbao.hbao, hbao.PUBLISHED), (gtao.gtao, gtao.PUBLISHED)]
-UNEVEN = screen.Parameters(1.3, 0.4, 0.05, 1.6, intensity=1.2, power=0.8, blur=0)
+UNEVEN = marching.Parameters(1.3, 0.4, 0.05, 1.6, intensity=1.2, power=0.8, blur=0)
 
 
 def shaded(method: Any, view: View) -> Float:

@@ -21,18 +21,8 @@ from typing import Any
 
 import drjit as dr
 
-from deepshade_report.baselines.ao.screen import (
-    RANGES,
-    TINY,
-    Marching,
-    Parameters,
-    Screen,
-    mi,
-    plane,
-    sample,
-    start,
-    stride,
-)
+from deepshade_report.baselines.ao.marching import RANGES, Marching, Parameters, sample
+from deepshade_report.baselines.screen import TINY, Screen, mi, plane, start, stride
 from deepshade_report.tuning import Tunable, tuned
 
 # slices and steps to each side, from cheap to best

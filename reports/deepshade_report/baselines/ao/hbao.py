@@ -18,17 +18,8 @@ from typing import Any
 
 import drjit as dr
 
-from deepshade_report.baselines.ao.screen import (
-    RANGES,
-    Marching,
-    Parameters,
-    Screen,
-    mi,
-    plane,
-    sample,
-    start,
-    stride,
-)
+from deepshade_report.baselines.ao.marching import RANGES, Marching, Parameters, sample
+from deepshade_report.baselines.screen import Screen, mi, plane, start, stride
 from deepshade_report.tuning import Tunable, tuned
 
 # directions and steps a direction, from cheap to best

@@ -1,4 +1,4 @@
-"""What HBAO and GTAO share: a view on the device, samples along slices, and the filter.
+"""What screen-space baselines share: a view on the device, samples along slices, and a filter.
 
 Dr.Jit compiles each method into one vectorised function that keeps a pixel's whole march in
 registers: the nearest that a processor comes to the shaders that these methods were made as. (As
@@ -11,15 +11,13 @@ function, so that every setting shares it. All lengths are in units of the effec
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade_report.tuning import Ranges
 from deepshade_report.view import Float, View
 from deepshade_workers.backend import mitsuba
 
@@ -28,40 +26,6 @@ mi = mitsuba()
 NEAREST = 1.3  # pixels between a pixel and its first sample, so that it never meets itself
 GOLDEN = 0.61803398875
 TINY = 1e-12
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """What can be tuned.
-
-    `radius` multiplies the effect's. `falloff` in (0, 1] is the share of it over which samples
-    lose their weight, up to the radius (HBAO: of its square). `bias` is how far over the tangent a
-    sample must rise (HBAO: in radians, GTAO: in sines). `spread` is the power that draws samples
-    towards the pixel. Occlusion is multiplied by `intensity`, what is left open is raised to
-    `power`. `blur` is the filter's half width in pixels (0 = none), `edge` the depth step, in
-    radii, that stops it.
-    """
-
-    radius: float
-    falloff: float
-    bias: float
-    spread: float
-    intensity: float = 1.0
-    power: float = 1.0
-    blur: int = 3
-    edge: float = 0.2
-
-
-RANGES: Ranges = {
-    "radius": (0.4, 2.5),
-    "falloff": (0.05, 1.0),
-    "bias": (0.0, 0.6),
-    "spread": (1.0, 2.5),
-    "intensity": (0.5, 2.5),
-    "power": (0.4, 2.5),
-    "blur": (0, 6),
-    "edge": (0.02, 0.5),
-}
 
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
@@ -95,17 +59,25 @@ class Screen:
         y = (self.axis.y - 0.5 - mi.Float(row)) * depth / self.scale
         return mi.Vector3f(x, y, -depth)
 
-    def look(self, plane: Any, column: Any, row: Any) -> tuple[Any, Any]:
-        """Any pixel's value of a plane, and whether it lies in the picture."""
+    def place(self, column: Any, row: Any) -> tuple[Any, Any]:
+        """Index of a pixel in a plane, and whether it lies in the picture."""
         inside = (column >= 0) & (row >= 0) & (column < self.width) & (row < self.height)
-        place = mi.UInt32(row * self.width + column)
-        return dr.gather(mi.Float, plane, place, inside), inside
+        return mi.UInt32(row * self.width + column), inside
+
+    def look(self, plane: Any, column: Any, row: Any) -> tuple[Any, Any]:
+        """Any pixel's value of a plane (or of three), and whether it lies in the picture."""
+        place, inside = self.place(column, row)
+        return dr.gather(type(plane), plane, place, inside), inside
 
 
 def open_screen(view: View) -> Screen:
-    """`view` on the device. Pixels that aren't finite, or behind the eye, hold nothing."""
+    """`view` on the device. Pixels that aren't finite, or behind the eye, hold nothing.
+
+    A method that uses no normals needs none.
+    """
     height, width = view.background.shape
-    position, normal = (view.attributes[name] for name in ("position", "normal"))
+    position = view.attributes["position"]
+    normal = view.attributes.get("normal", np.ones_like(position))
     depth = position[2] / np.float32(-view.radius)
     with np.errstate(invalid="ignore"):
         there: NDArray[np.bool_] = ~view.background & (depth > 0) & np.isfinite(depth)
@@ -120,7 +92,7 @@ def open_screen(view: View) -> Screen:
         dr.opaque(mi.Int32, width),
         dr.opaque(mi.Int32, height),
         mi.Float(np.where(there, depth, np.float32(0)).ravel()),
-        dr.normalize(mi.Vector3f(*(mi.Float(plane) for plane in planes))),
+        _unit(mi.Vector3f(*(mi.Float(plane) for plane in planes))),
         mi.Float(turn),
         mi.Float(offset),
         dr.opaque(mi.Float, camera.pixels_per_unit),
@@ -128,6 +100,11 @@ def open_screen(view: View) -> Screen:
     )
     dr.eval(screen.normal)
     return screen
+
+
+def _unit(vector: Any) -> Any:
+    """A direction, where there is one."""
+    return vector * dr.rcp(dr.maximum(dr.norm(vector), TINY))
 
 
 def jitter(column: NDArray[np.int64], row: NDArray[np.int64]) -> tuple[Float, Float]:
@@ -139,39 +116,6 @@ def jitter(column: NDArray[np.int64], row: NDArray[np.int64]) -> tuple[Float, Fl
     turn = ((((column + row) & 3) << 2) + (column & 3)) / 16
     step = ((row - column) & 3) / 4
     return turn.astype(np.float32), step.astype(np.float32)
-
-
-class Marching:
-    """A screen-space Method.
-
-    `settings` are how many directions or slices, and how many steps in each. The `kernel` gives
-    every pixel's occlusion of a Screen, these counts and all parameters but the filter's two.
-    """
-
-    family = "screen-space"
-
-    def __init__(
-        self,
-        name: str,
-        settings: dict[str, Any],
-        parameters: Parameters,
-        kernel: Callable[..., Any],
-    ) -> None:
-        self.name, self.settings = name, settings
-        self.parameters, self.kernel = parameters, kernel
-        self._screen: Screen | None = None
-
-    def prepare(self, view: View) -> None:
-        """Put the view on the device."""
-        self._screen = open_screen(view)
-
-    def shade(self, view: View) -> Float:
-        """(H, W) in [0, 1], 1 = open, of the prepared view."""
-        assert self._screen is not None
-        *given, blur, edge = astuple(self.parameters)
-        counts = [dr.opaque(mi.UInt32, count) for count in self.settings.values()]
-        numbers = [dr.opaque(mi.Float, float(value)) for value in given]
-        return finish(self._screen, self.kernel(self._screen, *counts, *numbers), blur, edge)
 
 
 def start(screen: Screen, column: Any, row: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -207,43 +151,31 @@ def stride(
     return distance * cos, -distance * sin
 
 
-def sample(
-    screen: Screen, here: Any, eye: Any, column: Any, row: Any, right: Any, down: Any, side: int
-) -> tuple[Any, Any]:
-    """A sample's elevation (sine) and squared distance; far off for nothing."""
-    c = mi.Int32(dr.round(mi.Float(column) + side * right))
-    r = mi.Int32(dr.round(mi.Float(row) + side * down))
-    depth, inside = screen.look(screen.depth, c, r)
-    delta = screen.position(c, r, depth) - here
-    squared = dr.squared_norm(delta)
-    elevation = dr.dot(delta, eye) * dr.rsqrt(dr.maximum(squared, TINY))
-    return elevation, dr.select(inside & (depth > 0), squared, 1e18)
-
-
-def finish(screen: Screen, image: Any, blur: int, edge: float) -> Float:
-    """(H, W): `image` filtered over `blur` pixels, down columns, then along rows.
+def smoothed(screen: Screen, image: Any, blur: int, edge: float, *, bent: bool = False) -> Any:
+    """`image` (a plane, or three) filtered over `blur` pixels, down columns, then along rows.
 
     The separable cross-bilateral filter of Bavoil and Sainz 2008 ("Image-Space Horizon-Based
     Ambient Occlusion", section on noise): a neighbour's weight falls with its distance on the
-    screen and to zero where its depth differs by `edge` radii.
+    screen and to zero where its depth differs by `edge` radii; with `bent`, also with the cosine
+    between the normals, to zero at 60 degrees.
     """
     dr.eval(image)
     if blur > 0:
         reach = [dr.opaque(mi.Int32, min(blur, size - 1)) for size in screen.shape]
         fade = dr.opaque(mi.Float, -2 / (blur + 1) ** 2)
         sharpness = dr.opaque(mi.Float, 1 / edge)
-        image = _smooth(screen, image, reach[0], fade, sharpness, down=1)
+        image = _smooth(screen, image, reach[0], fade, sharpness, down=1, bent=bent)
         dr.eval(image)
-        image = _smooth(screen, image, reach[1], fade, sharpness, down=0)
-    image = dr.select(screen.depth > 0, dr.clip(image, 0, 1), 1)
-    result: Float = image.numpy().reshape(screen.shape)
-    return result
+        image = _smooth(screen, image, reach[1], fade, sharpness, down=0, bent=bent)
+    return image
 
 
 @dr.syntax
-def _smooth(screen: Screen, image: Any, reach: Any, fade: Any, sharpness: Any, *, down: int) -> Any:
+def _smooth(
+    screen: Screen, image: Any, reach: Any, fade: Any, sharpness: Any, *, down: int, bent: bool
+) -> Any:
     column, row = screen.pixels()
-    total, weights = mi.Float(image), mi.Float(1)
+    total, weights = type(image)(image), mi.Float(1)
     shift = mi.Int32(1)
     while shift <= reach:
         gauss = dr.exp(fade * mi.Float(shift * shift))
@@ -252,6 +184,9 @@ def _smooth(screen: Screen, image: Any, reach: Any, fade: Any, sharpness: Any, *
             other, inside = screen.look(screen.depth, c, r)
             value, _ = screen.look(image, c, r)
             near = dr.maximum(1 - dr.abs(other - screen.depth) * sharpness, 0)
+            if dr.hint(bent, mode="scalar"):
+                normal, _ = screen.look(screen.normal, c, r)
+                near *= dr.maximum(2 * dr.dot(normal, screen.normal) - 1, 0)
             weight = dr.select(inside, near * gauss, 0)
             total = dr.fma(weight, value, total)
             weights += weight

@@ -1,0 +1,96 @@
+"""What HBAO and GTAO share: their parameters, a sample's elevation, and the Method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import drjit as dr
+
+from deepshade_report.baselines.screen import TINY, Screen, mi, open_screen, smoothed
+from deepshade_report.tuning import Ranges
+from deepshade_report.view import Float, View
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What can be tuned.
+
+    `radius` multiplies the effect's. `falloff` in (0, 1] is the share of it over which samples
+    lose their weight, up to the radius (HBAO: of its square). `bias` is how far over the tangent a
+    sample must rise (HBAO: in radians, GTAO: in sines). `spread` is the power that draws samples
+    towards the pixel. Occlusion is multiplied by `intensity`, what is left open is raised to
+    `power`. `blur` is the filter's half width in pixels (0 = none), `edge` the depth step, in
+    radii, that stops it.
+    """
+
+    radius: float
+    falloff: float
+    bias: float
+    spread: float
+    intensity: float = 1.0
+    power: float = 1.0
+    blur: int = 3
+    edge: float = 0.2
+
+
+RANGES: Ranges = {
+    "radius": (0.4, 2.5),
+    "falloff": (0.05, 1.0),
+    "bias": (0.0, 0.6),
+    "spread": (1.0, 2.5),
+    "intensity": (0.5, 2.5),
+    "power": (0.4, 2.5),
+    "blur": (0, 6),
+    "edge": (0.02, 0.5),
+}
+
+
+class Marching:
+    """A screen-space Method.
+
+    `settings` are how many directions or slices, and how many steps in each. The `kernel` gives
+    every pixel's occlusion of a Screen, these counts and all parameters but the filter's two.
+    """
+
+    family = "screen-space"
+
+    def __init__(
+        self,
+        name: str,
+        settings: dict[str, Any],
+        parameters: Parameters,
+        kernel: Callable[..., Any],
+    ) -> None:
+        self.name, self.settings = name, settings
+        self.parameters, self.kernel = parameters, kernel
+        self._screen: Screen | None = None
+
+    def prepare(self, view: View) -> None:
+        """Put the view on the device."""
+        self._screen = open_screen(view)
+
+    def shade(self, view: View) -> Float:
+        """(H, W) in [0, 1], 1 = open, of the prepared view."""
+        assert self._screen is not None
+        *given, blur, edge = astuple(self.parameters)
+        counts = [dr.opaque(mi.UInt32, count) for count in self.settings.values()]
+        numbers = [dr.opaque(mi.Float, float(value)) for value in given]
+        image = smoothed(self._screen, self.kernel(self._screen, *counts, *numbers), blur, edge)
+        image = dr.select(self._screen.depth > 0, dr.clip(image, 0, 1), 1)
+        result: Float = image.numpy().reshape(self._screen.shape)
+        return result
+
+
+def sample(
+    screen: Screen, here: Any, eye: Any, column: Any, row: Any, right: Any, down: Any, side: int
+) -> tuple[Any, Any]:
+    """A sample's elevation (sine) and squared distance; far off for nothing."""
+    c = mi.Int32(dr.round(mi.Float(column) + side * right))
+    r = mi.Int32(dr.round(mi.Float(row) + side * down))
+    depth, inside = screen.look(screen.depth, c, r)
+    delta = screen.position(c, r, depth) - here
+    squared = dr.squared_norm(delta)
+    elevation = dr.dot(delta, eye) * dr.rsqrt(dr.maximum(squared, TINY))
+    return elevation, dr.select(inside & (depth > 0), squared, 1e18)
