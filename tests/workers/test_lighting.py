@@ -36,7 +36,7 @@ def irradiance(points: np.ndarray, intensity: float = 3.0) -> np.ndarray:
     """I cosθ / r² of the lamp on a floor that faces up."""
     toward = LAMP[:, None] - points
     distance = np.linalg.norm(toward, axis=0)
-    return intensity * toward[1] / distance**3
+    return np.asarray(intensity * toward[1] / distance**3)
 
 
 def test_a_point_lamp_falls_with_the_square_of_its_distance(floor: Scene, down: Camera) -> None:

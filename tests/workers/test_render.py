@@ -106,7 +106,7 @@ def test_json_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["--size", "0x5"], "--size"),
         (["--size", "big"], "--size"),
         (["--effects", "aoo"], "ao"),
-        (["--effects", "gi"], "no reference for 'gi'; there are: ao"),
+        (["--effects", "ibl"], "no reference for 'ibl'; there are: aa, ao"),
         (["--radius", "-1"], "radius"),
         (["--radius", "nan"], "radius"),
         (["--fov", "180"], "field of view"),

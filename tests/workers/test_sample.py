@@ -60,9 +60,9 @@ def test_every_effect_of_the_table_or_a_list_of_those_there_are(tmp_path: Path) 
     scene, out = open_scene("procedural:crockery:1"), tmp_path / "a.exr"
     view = View(Camera.look_at((2, 3, 4), (0, 0.4, 0), (0, 1, 0), 50, 8, 8), 0.3)
     for effect in {*EFFECTS, "nothing"} - set(references.known()):
-        with pytest.raises(ConfigError, match=f"no reference for '{effect}'; there are: ao"):
+        with pytest.raises(ConfigError, match=f"no reference for '{effect}'; there are: aa, ao"):
             DataSpec(scenes=("procedural:room",), views=1, effects=("ao", effect))
-        with pytest.raises(ConfigError, match=f"no reference for '{effect}'; there are: ao"):
+        with pytest.raises(ConfigError, match=f"no reference for '{effect}'; there are: aa, ao"):
             render(scene, view, out, effects=["ao", effect], samples=2, seed=1)
     assert not out.exists()
 
