@@ -58,7 +58,9 @@ def compose(parts: str, files: tuple[Path, ...], load: Callable[[Path], Mesh], s
     chosen = [kinds[k] for k in rng.integers(len(kinds), size=count)]
     solids = {kind: _standing(load(files[kind])) for kind in kinds.tolist()}
     half = float(np.sqrt(count)) * rng.uniform(0.55, 0.9)  # of the floor's side
-    placed, names, taken = [], [], np.zeros((0, 3))
+    placed: list[Mesh] = []
+    names: list[str] = []
+    taken = np.zeros((0, 3))
     for number, kind in enumerate(chosen):
         size = rng.uniform(0.8, 1.25)
         solid = solids[kind]
