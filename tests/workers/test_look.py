@@ -55,7 +55,7 @@ def test_near_by_it_is_the_texture_between_its_texels(floors: Scene, monkeypatch
     found = values(floors, view, hits, "diffuse").reshape(3, -1)
     object_number = 1  # x > 0
     layer = int(look.layer.numpy()[object_number])
-    texture = draw_textures(np.random.default_rng(RECORD.seed), looks.TEXTURES)[layer]
+    texture = draw_textures(np.random.default_rng(RECORD.seed), 2)[layer]
     p = hits.p.numpy().astype(np.float64)
     across, offset = (a.numpy()[:, object_number] for a in (look.across, look.offset))
     u = across[0] * p[0] + across[1] * p[2] + offset[0]
@@ -79,7 +79,7 @@ def test_far_away_it_is_the_textures_mean(floors: Scene, monkeypatch: Any) -> No
     assert look is not None
     hits = trace(floors, camera, 2, 2)
     found = values(floors, view, hits, "diffuse").reshape(3, -1)
-    textures = draw_textures(np.random.default_rng(RECORD.seed), looks.TEXTURES)
+    textures = draw_textures(np.random.default_rng(RECORD.seed), 2)
     for k, x in enumerate(hits.p.numpy()[0]):
         number = int(x > 0)
         mean = textures[int(look.layer.numpy()[number])].mean((0, 1))

@@ -32,7 +32,7 @@ LAMPS = 8
 LAMP_DISTANCES = (0.3, 3.0)
 # Irradiance (median over what the lamp lights) and the sky's radiance.
 IRRADIANCES = (0.5, 4.0)
-HOTSPOT = 5.0  # what is nearest to the lamp gets at most about so many times that
+HOTSPOT = 10.0  # what is nearest to the lamp gets at most about so many times that
 SKIES = (0.02, 1.5)
 DARK_SKIES = 0.12  # the share of views whose sky is nearly black
 LEAST_PIXELS = 2.0  # of the blur and of motions that there are

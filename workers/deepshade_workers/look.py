@@ -26,7 +26,7 @@ mi = mitsuba()
 
 Floats = NDArray[np.float64]
 
-# Textures of one view: objects share them, each in its own tint, scale, turn and place.
+# The most textures of one view: objects share them, each in its own tint, scale, turn and place.
 TEXTURES = 8
 PLAIN_SHARE = 0.25
 METAL_SHARE = 0.12
@@ -58,10 +58,11 @@ class Look:
     def draw(cls, scene: Scene, camera: Camera, record: LookRecord) -> Look:
         """The look that `record` stands for, of the objects of `scene` seen by `camera`."""
         rng = np.random.default_rng(record.seed)
-        textures = [] if record.own else draw_textures(rng, TEXTURES, record.textures)
         count = max(1, len(scene.objects))
+        kinds = min(TEXTURES, count)
+        textures = [] if record.own else draw_textures(rng, kinds, record.textures)
         plain = rng.random(count) < PLAIN_SHARE
-        layer = np.where(plain, TEXTURES, rng.integers(TEXTURES, size=count))
+        layer = np.where(plain, TEXTURES, rng.integers(kinds, size=count))
         tint, specular, gloss = _phong(rng, plain)
         repeats = 1 / (
             record.length * np.exp(rng.uniform(np.log(REPEATS[0]), np.log(REPEATS[1]), count))

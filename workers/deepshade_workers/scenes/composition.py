@@ -19,6 +19,8 @@ from deepshade_workers.scenes.mesh import Floats, Mesh, merge
 from deepshade_workers.scenes.procedural.primitives import Rng, box, place, turn_y
 
 COUNTS = (8, 32)
+# Beyond so many triangles no more meshes are placed: a scene takes about a second to make.
+MAX_FACES = 250_000
 # Sizes come nearer to each other: the largest side becomes side^SIZING, by the typical one's.
 SIZING = 0.6
 WALL_SHARE = 0.6
@@ -56,10 +58,14 @@ def compose(parts: str, files: tuple[Path, ...], load: Callable[[Path], Mesh], s
     chosen = [kinds[k] for k in rng.integers(len(kinds), size=count)]
     solids = {kind: _standing(load(files[kind])) for kind in kinds.tolist()}
     half = float(np.sqrt(count)) * rng.uniform(0.55, 0.9)  # of the floor's side
-    placed, names, taken = [], [], np.zeros((0, 3))
+    placed: list[Mesh] = []
+    names: list[str] = []
+    taken = np.zeros((0, 3))
     for number, kind in enumerate(chosen):
         size = rng.uniform(0.8, 1.25)
         solid = solids[kind]
+        if number and sum(len(other.faces) for other in placed) + len(solid.faces) > MAX_FACES:
+            continue
         reach = size * float(np.linalg.norm(solid.vertices[:, [0, 2]], axis=1).max())
         spot = _free_spot(rng, half, reach, taken)
         taken = np.concatenate([taken, [[*spot, reach]]])
