@@ -32,7 +32,7 @@ def floors() -> Scene:
 
 def values(scene: Scene, view: View, hits: Any, name: str) -> np.ndarray:
     channels = 1 if name == "gloss" else 3
-    return hits.planar(material(scene, view, hits.surface, hits.valid, name, channels))
+    return np.asarray(hits.planar(material(scene, view, hits.surface, hits.valid, name, channels)))
 
 
 def above(height: float, size: int = 16) -> Camera:

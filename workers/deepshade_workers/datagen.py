@@ -99,8 +99,12 @@ class DataSpec:
         return Limits(self.max_blur, self.max_motion, self.max_scatter, self.textures)
 
     def settings(self) -> dict[str, Any]:
-        """JSON-ready settings, for the manifest."""
-        return {**asdict(self), "scenes": list(self.scenes), "effects": list(self.effects)}
+        """JSON-ready settings, for the manifest; those that nothing depends on are left out."""
+        found = {**asdict(self), "scenes": list(self.scenes), "effects": list(self.effects)}
+        if self.limits is None:
+            for key in asdict(Limits()):
+                del found[key]
+        return found
 
 
 def expand_scenes(names: list[str]) -> tuple[str, ...]:
