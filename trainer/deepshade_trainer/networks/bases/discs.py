@@ -11,8 +11,8 @@ from torch.nn import functional as F
 from deepshade_trainer.networks.bases.base import Bases, State
 from deepshade_trainer.networks.receptive_field import Span, doubled, folded, grown, joined
 
-# The discs' radii are 0 and 1 pixels at full resolution, 2, 4 and 8 at half, 16 and 24 at a quarter;
-# a circle between two of them is shared out to both.
+# The discs' radii are 0 and 1 pixels at full resolution, 2, 4 and 8 at half, 16 and 24 at a
+# quarter; a circle between two of them is shared out to both.
 _FAINT = 1e-3  # what is hidden still counts where nothing else is there
 _SURE = 4.0  # weights end at e^±4
 
@@ -25,11 +25,11 @@ class Discs(Bases):
     in focus and that over the far side (layered depth of field: Scofield, "2½-D Depth-of-Field
     Simulation for Computer Animation", 1992; near and far fields: Jimenez, "Next Generation Post
     Processing in Call of Duty: Advanced Warfare", 2014), each by its coverage, so that what was
-    hidden is continued from around. Weights change how much each layer counts.
+    hidden is continued from around. Two weights change how much the near and the far side count.
     """
 
-    told = 5
-    weights = 4
+    told = 2
+    weights = 2
     size_multiple = 4
 
     disc1: Tensor
@@ -71,9 +71,7 @@ class Discs(Bases):
         over = strong[:, :4] + (1 - strong[:, :1].clamp(max=1)) * mild[:, :4]
         under = mild[:, 4:] + (1 - mild[:, 4:5].clamp(max=1)) * strong[:, 4:]
         layers = sharp, one, _twice(over), _twice(under)
-        cover = [each[:, :1] for each in layers]
-        told = torch.cat([focal / (focal.abs() + 4), *(each.clamp(max=2) for each in cover)], 1)
-        return told, layers
+        return torch.cat([focal / (focal.abs() + 4), layers[2][:, :1].clamp(max=2)], 1), layers
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
@@ -81,9 +79,7 @@ class Discs(Bases):
         gains = torch.split(torch.exp(torch.tanh(weights / _SURE) * _SURE), 1, 1)
         left = 1 - near[:, :1].clamp(max=1)
         behind = left * (1 - (sharp[:, :1] + one[:, :1]).clamp(max=1)) + _FAINT
-        left = left + _FAINT
-        total = near * gains[2] + far * (behind * gains[3])
-        total = total + sharp * (left * gains[0]) + one * (left * gains[1])
+        total = near * gains[0] + far * (behind * gains[1]) + (sharp + one) * (left + _FAINT)
         return total[:, 1:] / total[:, :1].clamp_min(1e-12)
 
     def receptive_field(self, pixel: int) -> Span:

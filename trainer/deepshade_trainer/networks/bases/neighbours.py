@@ -21,9 +21,9 @@ class Neighbours(Bases):
     """The pixel and its four neighbours; input: depth (1), light (3).
 
     A weight moves light from its neighbour: share_k = exp(weight_k) / (1 + Σ exp(weight)).
-    (Blending with a neighbour is what morphological anti-aliasing does: Jimenez et al., "SMAA: Enhanced
-    Subpixel Morphological Antialiasing", 2012.) The network is told light relative to that of the
-    block of pixels, and depth relative to the nearest around.
+    (Blending with a neighbour is what morphological anti-aliasing does: Jimenez et al., "SMAA:
+    Enhanced Subpixel Morphological Antialiasing", 2012.) The network is told light relative to that
+    of the block of pixels, and the nearness.
     """
 
     told = 4
