@@ -182,8 +182,9 @@ class Lines(Bases):
         for j in range(side):
             for i in range(side):
                 there = cells[:, :, j : j + height, i : i + width]
-                away = max(0, max(abs(i - _TILES), abs(j - _TILES)) - 1) * _TILE
-                away += 0.5 * max(abs(i - _TILES), abs(j - _TILES))
+                tiles = max(abs(i - _TILES), abs(j - _TILES))
+                # of equals, the nearer
+                away = max(0, tiles - 1) * _TILE + 0.5 * tiles
                 score = there[:, 2:] - away
                 better = (score > best).to(own.dtype)
                 best = torch.maximum(best, score)
