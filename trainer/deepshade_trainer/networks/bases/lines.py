@@ -182,9 +182,9 @@ class Lines(Bases):
         for j in range(side):
             for i in range(side):
                 there = cells[:, :, j : j + height, i : i + width]
-                tiles = max(abs(i - _TILES), abs(j - _TILES))
+                ring = max(abs(i - _TILES), abs(j - _TILES))
                 # of equals, the nearer
-                away = max(0, tiles - 1) * _TILE + 0.5 * tiles
+                away = max(0, ring - 1) * _TILE + 0.5 * ring
                 score = there[:, 2:] - away
                 better = (score > best).to(own.dtype)
                 best = torch.maximum(best, score)
