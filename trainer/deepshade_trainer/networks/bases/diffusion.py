@@ -74,7 +74,7 @@ class Diffusion(Bases):
         sizes = [_repeated(angle, 2 ** (_LEVELS - level)) for level in range(_LEVELS + 1)]
         size = place[:, 2:] * -sizes[1] + _TINY
         slope = _slope(place, some, size)
-        cells = torch.cat([place, some, slope, both * (slope * size * size)], 1)
+        cells = torch.cat([place, some, slope, both * (slope * size * size * 4)], 1)
         levels: list[Tensor] = []  # where cells are, and how large
         sums: list[Tensor] = []  # light and area of each Gaussian, 6 channels
         for level in range(1, _LEVELS + 1):
@@ -120,7 +120,7 @@ class Diffusion(Bases):
         quarter = quarter / some.clamp_min(0.0625)
         finer = [_finer(quarter * 0.5**level) for level in range(2, _LEVELS + 3)]
         parts = [
-            part * _pair((more - less) * _gain(gain))
+            part * _pair(F.relu(more - less) * _gain(gain))
             for part, (less, more), gain in zip(
                 torch.split(wide, 6, 1), itertools.pairwise(finer), levels[1:], strict=True
             )
