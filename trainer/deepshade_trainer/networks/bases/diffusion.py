@@ -115,7 +115,9 @@ class Diffusion(Bases):
 
         paths, some = torch.split(half, 3, 1)
         paths = paths / some.clamp_min(0.25)
-        total = middle * _pair((_finer(paths * 0.25) - _finer(paths * 0.5)) * _twice(_gain(levels[0])))
+        total = middle * _pair(
+            (_finer(paths * 0.25) - _finer(paths * 0.5)) * _twice(_gain(levels[0]))
+        )
         quarter, some = torch.split(F.avg_pool2d(half, 2), 3, 1)
         quarter = quarter / some.clamp_min(0.0625)
         finer = [_finer(quarter * 0.5**level) for level in range(2, _LEVELS + 3)]
@@ -182,9 +184,7 @@ def _coarser(cells: Tensor, size: Tensor) -> Tensor:
     rows = cells.reshape(cells.shape[0], 11, height // 2, 2, width // 2, 2)
     four = [rows[:, :, :, j, :, i] for j, i in itertools.product((0, 1), (0, 1))]
     depth = [one[:, 2:3] + (one[:, 3:4] - 1) * _AWAY for one in four]  # negative
-    front = torch.maximum(
-        torch.maximum(depth[0], depth[1]), torch.maximum(depth[2], depth[3])
-    )
+    front = torch.maximum(torch.maximum(depth[0], depth[1]), torch.maximum(depth[2], depth[3]))
     scale = (front * size).abs().clamp_min(_TINY).reciprocal() * (1 / _SLACK)
     kept = [
         torch.exp(((z - front) * scale).clamp(-8, 0).square() * -0.5) * one[:, 3:4]
@@ -215,9 +215,7 @@ def _guided(wide: Tensor, coarse: Tensor, fine: Tensor, cell: float) -> Tensor:
         here, fall = torch.split(quarters[:, :, :, j, :, i], [3, 1], 1)
         total = weight = None
         for down, right in itertools.product((0, 2 * j - 1), (0, 2 * i - 1)):
-            there, theirs = torch.split(
-                _cut(margin, 1, down, right), [3, wide.shape[1]], 1
-            )
+            there, theirs = torch.split(_cut(margin, 1, down, right), [3, wide.shape[1]], 1)
             share = (0.25 if down else 0.75) * (0.25 if right else 0.75)
             close = torch.exp(_square(there - here) * fall) * share
             total = theirs * close if total is None else total + theirs * close
