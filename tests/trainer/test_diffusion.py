@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
+import torch  # noqa: E402
 
 from deepshade_trainer.networks.bases.diffusion import Diffusion  # noqa: E402
 
@@ -103,7 +104,7 @@ def test_tiles_equal_the_whole() -> None:
     size = bases.size_multiple
     start = max(0, first // size * size)
     stop = min(128 * 18, (last // size + 1) * size)
-    assert 0 < start and stop < 128 * 18
+    assert start > 0 and stop < 128 * 18
     whole = _shade(gbuffer)[..., 128 * 9 : 128 * 10]
     tile = _shade(gbuffer[..., start:stop])[..., 128 * 9 - start : 128 * 10 - start]
     torch.testing.assert_close(tile, whole, rtol=0, atol=1e-5)

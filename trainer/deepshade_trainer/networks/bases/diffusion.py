@@ -17,7 +17,7 @@ import itertools
 import math
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from deepshade_trainer.networks.bases.base import Bases, State
