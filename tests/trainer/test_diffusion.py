@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
+import torch
 
-pytest.importorskip("torch")
-import torch  # noqa: E402
-
-from deepshade_trainer.networks.bases.diffusion import Diffusion  # noqa: E402
+from deepshade_trainer.networks.bases.diffusion import Diffusion
 
 FOCAL = 300.0  # pixels
 

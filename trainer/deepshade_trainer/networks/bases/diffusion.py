@@ -27,7 +27,7 @@ from deepshade_trainer.networks.receptive_field import Span, doubled, folded, gr
 # Levels of the pyramid: cells are 2^level pixels wide.
 _LEVELS = 7
 # The Gaussians' deviation in cells, all told; pooling and interpolating do _SPREAD of its square.
-_SIGMA, _SPREAD = 0.8, 0.25
+_SIGMA, _SPREAD = 0.8, 0.3
 # The coarsest level also makes the Gaussian an octave wider, from more of its cells.
 _REACH = 2
 # The mass of all Gaussians narrower than 1 is about (1 + ax + bx^2) / (1 + cx + ex^2 + gx^3),
