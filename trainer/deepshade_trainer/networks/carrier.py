@@ -75,7 +75,9 @@ class Carrier(Network):
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        first, last = self.trunk.receptive_field(pixel)
+        reach = self.bases.reach
+        first = self.trunk.receptive_field(pixel - reach)[0]
+        last = self.trunk.receptive_field(pixel + reach)[1]
         wide = joined(self.bases.receptive_field(first), self.bases.receptive_field(last))
         return joined(wide, self.bases.receptive_field(pixel))
 

@@ -3,6 +3,6 @@
 from deepshade_trainer.presets.paper import PAPER
 
 PRESETS = {
-    "balanced": {},
+    "balanced": {"network": {"kind": "carrier", "bases": "diffusion", "widths": (32, 64, 96)}},
     "paper": {**PAPER, "network": {"kind": "paper", "u0": 16, "levels": 5}},
 }

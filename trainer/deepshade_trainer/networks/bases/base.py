@@ -16,12 +16,14 @@ class Bases(nn.Module, ABC):
     """Light filtered in several ways, and how weights blend them. All of it is float32.
 
     `told` is how many channels the network that predicts the weights is given, `weights` how many
-    it gives. All weights 0 is the classical answer.
+    it gives. All weights 0 is the classical answer. A pixel's answer depends on the weights up to
+    `reach` pixels away.
     """
 
     told: ClassVar[int]
     weights: ClassVar[int]
     size_multiple: ClassVar[int] = 1
+    reach: ClassVar[int] = 0
 
     @abstractmethod
     def features(self, gbuffer: Tensor) -> tuple[Tensor, State]:
