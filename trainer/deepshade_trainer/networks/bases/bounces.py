@@ -48,6 +48,8 @@ RAYS = (
 _TOLD, _HIDDEN = 4, 32  # of each point; of a ray's network
 _MOST = 3.0  # of the logarithm of a gain
 _CAUTION = 0.1  # of the trunk's weights, so that it begins near the horizons' answer
+# And of light from anywhere: where little is seen, little of it is much.
+_GUESS = 0.1
 _AWAY = 1e4  # effect radii
 # A point reaches higher by half of what it rises, but by no more than half of this.
 _STEP = 0.25
@@ -161,7 +163,7 @@ class Bounces(Bases):
         gain, bend, open_, hidden = torch.split(weights * _CAUTION, [1, 3, 1, 1], 1)
         i, j, k = torch.split(normal + bend, 1, 1)
         image = x * i + y * j + z * k + seen * open_
-        return image * torch.exp(gain.clamp(-_MOST, _MOST)) + around * hidden
+        return image * torch.exp(gain.clamp(-_MOST, _MOST)) + around * (hidden * _GUESS)
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
