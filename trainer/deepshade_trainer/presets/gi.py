@@ -3,6 +3,14 @@
 from deepshade_trainer.presets.paper import PAPER
 
 PRESETS = {
-    "balanced": {},
+    "balanced": {
+        "network": {
+            "kind": "carrier",
+            "bases": "bounces",
+            "widths": (32, 64, 96),
+            "normal": 0,
+            "position": 3,
+        }
+    },
     "paper": {**PAPER, "network": {"kind": "paper", "u0": 16, "levels": 5}, "batch": 45},
 }
