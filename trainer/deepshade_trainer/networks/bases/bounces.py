@@ -63,8 +63,8 @@ class Bounces(Bases):
     """Light of one bounce; input: normal (3), position (3, effect radii), diffuse light (3).
 
     The trunk's weights at a pixel: the logarithm of a gain; three numbers to add to its normal; a
-    share of the light that its cell sees, from wherever; and a share of the mean light around, for
-    what the picture doesn't show. All zero is the horizons' answer.
+    share of the light that its cell sees, from wherever; and a share of the mean light within the
+    radius, for what the picture doesn't show. All zero is the horizons' answer.
     """
 
     told = 6  # normal and position as they are: a geometric trunk tells itself the horizons
@@ -97,7 +97,7 @@ class Bounces(Bases):
         """What cells receive (N, 15, h, w) of the light of others (N, 3, h, w), at each ring.
 
         Of each colour: the vector irradiance's x, y and z over π, the light of all its sectors
-        over 2 π, and the mean light around.
+        over 2 π, and the mean light within the radius.
         """
         size = (len(position), -1, len(RAYS), *position.shape[2:])
         across, depth = torch.split(position, [2, 1], 1)
@@ -115,7 +115,7 @@ class Bounces(Bases):
         low = leaning * -1 * torch.rsqrt(leaning * leaning + facing * facing)
         horizon = _stacked(low.unsqueeze(1))  # (N, 1, rays h, w)
         centre, eye = _repeated(here), torch.split(_repeated(view), 1, 1)
-        told, towards, sideways, seen, sent = [], [], [], [], []
+        told, towards, sideways, seen, close, sent = [], [], [], [], [], []
         before = horizon * 0
         for ring, light in zip(RINGS, lights, strict=True):
             there = _moved(torch.cat([here, normal, light], 1), ring)  # (N, 9, rays h, w)
@@ -139,6 +139,7 @@ class Bounces(Bases):
             towards.append(rise * (above + horizon) * 0.5)
             sideways.append(_arc(above) + _arc(horizon) * -1)
             seen.append(rise)
+            close.append(near)
             sent.append(light)
             horizon = above
         gains = torch.exp(self.ray(torch.cat(told, 1)).clamp(-_MOST, _MOST))
@@ -147,13 +148,17 @@ class Bounces(Bases):
             shares = torch.split(torch.cat(parts, 1) * gains, 1, 1)
             total = _total(part * s for part, s in zip(sent, shares, strict=True))
             sums.append(total.reshape(size))  # (N, 3, rays, h, w)
+        # the mean light of all points within the radius, be they visible from here or not
+        reached = _total(part * n for part, n in zip(sent, close, strict=True)).reshape(size)
+        count = _total(close).reshape(size).sum(2)
+        around = reached.sum(2) / count.clamp_min(1)
         share = 1 / len(RAYS)
         side = sums[1] * (upright * (2 * share)).unsqueeze(1)
         right, up = ((side * along[k]).sum(2) for k in (0, 1))
         x, y, z = torch.split(view, 1, 1)
         depth = sums[0].sum(2) * (2 * share) - right * x - up * y
         open_ = sums[2].sum(2) * share
-        return torch.cat([right + depth * x, up + depth * y, depth * z, open_, lights[-1]], 1)
+        return torch.cat([right + depth * x, up + depth * y, depth * z, open_, around], 1)
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
