@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from deepshade import exr, tensors
-from deepshade.attributes import ATTRIBUTES
+from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade_service.config import Settings
@@ -79,7 +79,8 @@ def test_a_served_answer_is_the_networks(models: Path, local: Local, effect: str
     given = tensors.tensor(
         EFFECTS[effect], inputs, bundle.inputs, RADIUS, per_channel=bundle.per_channel
     )
-    given = np.pad(given, ((0, 0), (0, 0), (0, 64 - HEIGHT), (0, 128 - WIDTH)))
+    rows, columns = (tensors.up(side, bundle.size_multiple) for side in (64, 128))
+    given = np.pad(given, ((0, 0), (0, 0), (0, rows - HEIGHT), (0, columns - WIDTH)))
     with torch.inference_mode():
         expected = from_bundle(bundle.path)(torch.from_numpy(given)).flatten(0, 1).numpy()
     expected = expected[:, :HEIGHT, :WIDTH].clip(*EFFECTS[effect].range)
@@ -93,16 +94,14 @@ def test_a_served_answer_is_the_networks(models: Path, local: Local, effect: str
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
 @pytest.mark.parametrize("effect", [name for name, row in EFFECTS.items() if row.per_channel])
-def test_a_channel_answers_as_it_would_alone(local: Local, effect: str) -> None:
+def test_the_answer_scales_with_the_light(local: Local, effect: str, factor: float) -> None:
+    """Light of up to 1e5 and down to 1e-3, and a thousand times more and less of it."""
     inputs = scene(effect)
-    together = shaded(local, effect, inputs)
-    for channel in range(3):
-        alone = {
-            name: np.repeat(planes[channel : channel + 1], 3, 0)
-            if ATTRIBUTES[name].coloured
-            else planes
-            for name, planes in inputs.items()
-        }
-        for plane in shaded(local, effect, alone):
-            assert (plane == together[channel]).all()
+    scaled = {
+        name: planes * np.float32(factor) if ATTRIBUTES[name].unit is RADIANCE else planes
+        for name, planes in inputs.items()
+    }
+    answer = shaded(local, effect, inputs)
+    assert shaded(local, effect, scaled) / factor == pytest.approx(answer, rel=1e-3, abs=1e-2)

@@ -21,8 +21,8 @@ from deepshade_trainer.training import train
 SIZE = 64
 RADIUS = 0.5
 # What a fold network of a few thousand parameters is, instead of a preset's million.
-SMALL: dict[str, Any] = {"widths": (8, 12), "steps": (2,), "down": (1, 1), "up": (1,)}
-SMALL |= {"rings": (1,), "fine_rings": (1, 2), "detail": ()}
+TRUNK: dict[str, Any] = {"widths": (8, 12), "steps": (2,), "down": (1, 1), "up": (1,)}
+SMALL = TRUNK | {"rings": (1,), "fine_rings": (1, 2), "detail": ()}
 
 
 def arrays(effect: str, seed: int, height: int = SIZE, width: int = SIZE) -> dict[str, Any]:
@@ -91,7 +91,8 @@ def write_data(folder: Path, effect: str, count: int = 8) -> Path:
 def small(effect: str, name: str) -> Recipe:
     """A preset, its network small if it is ours, for one step of two views."""
     recipe = preset(name, effect).changed(steps=1, batch=2, val_fraction=0.2, precision="fp32")
-    return recipe.changed(network=SMALL) if recipe.network.kind == "fold" else recipe
+    shape = {"fold": SMALL, "carrier": TRUNK}.get(recipe.network.kind, {})
+    return recipe.changed(network=shape)
 
 
 def make_bundle(effect: str, root: Path, name: str = "balanced") -> Bundle:

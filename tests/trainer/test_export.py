@@ -105,7 +105,7 @@ def test_an_export_splits_scenes_as_training_did(data: Path, recipe: Recipe) -> 
         }
         learnt, unseen = (
             {whole[gbuffer.numpy().tobytes()] for gbuffer in found}
-            for found in gbuffers(recipe.changed(seed=seed), [data])
+            for found in gbuffers(recipe.changed(seed=seed), [data], per_channel=False)
         )
         assert learnt == set(training)
         assert unseen == set(held)

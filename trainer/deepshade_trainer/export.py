@@ -68,7 +68,7 @@ def export(
     """
     recipe, shader = load_shader(run)
     effect = EFFECTS[recipe.effect]
-    trained, held = gbuffers(recipe, data, shader.per_channel)
+    trained, held = gbuffers(recipe, data, shader.per_channel, shader.size_multiple)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).unlink(missing_ok=True)  # no bundle while its graph changes
     graph = write_onnx(shader, folder / MODEL)
@@ -105,7 +105,7 @@ def export(
 
 
 def gbuffers(
-    recipe: Recipe, folders: Sequence[Path], per_channel: bool
+    recipe: Recipe, folders: Sequence[Path], per_channel: bool, multiple: int = 1
 ) -> tuple[list[Tensor], list[Tensor]]:
     """G-buffers (N, C, H, W) of samples that were trained on, and of some that were held out.
 
@@ -116,7 +116,7 @@ def gbuffers(
 
     def some(numbers: Sequence[int], count: int) -> list[Tensor]:
         chosen = [numbers[k] for k in spread(len(numbers), count)]
-        found = [samples.gbuffer(samples.load(k), samples.radius(k)) for k in chosen]
+        found = [samples.gbuffer(samples.load(k), samples.radius(k), multiple) for k in chosen]
         return [torch.from_numpy(gbuffer) for gbuffer in found]
 
     return some(training, RANGE_SAMPLES), some(held or training, PARITY_SAMPLES)

@@ -199,7 +199,9 @@ class _Trainer:
         self.shader.train()
         mixed = recipe.precision == "bf16"
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
-            image = self.shader.on_curve(gbuffer)
+            image = self.shader.on_curve(self.shader.padded(gbuffer))
+        height, width = reference.shape[2:]
+        image = image[:, :, :height, :width]
         loss = self.loss(*self.shader.compared(image, reference))
         self.optimizer.zero_grad(set_to_none=True)
         if not torch.isfinite(loss):
@@ -231,8 +233,9 @@ class _Trainer:
             sample = self.data.load(number)
             gbuffer = torch.from_numpy(self.data.gbuffer(sample, self.data.radius(number)))
             with torch.inference_mode():
-                answer = shader(gbuffer.to(self.device)).cpu().flatten(0, 1).numpy()
+                answer = shader(shader.padded(gbuffer.to(self.device))).cpu().flatten(0, 1).numpy()
             reference = sample[self.data.reference]
+            answer = answer[:, : reference.shape[1], : reference.shape[2]]
             blank = judging.trivial(effect, sample, reference)
             image, truth, nothing = (
                 torch.from_numpy(each)[None]

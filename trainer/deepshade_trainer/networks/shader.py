@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from deepshade import transfer
 from deepshade.attributes import ATTRIBUTES, RADIANCE
@@ -63,6 +64,11 @@ class Shader(nn.Module):
         unbounded = self.training or self.effect.range == (None, None)
         return image if unbounded else image.clamp(*self.effect.range)
 
+    def padded(self, gbuffer: Tensor) -> Tensor:
+        """(N, C, H, W) with zeros to the right and below, up to multiples of `size_multiple`."""
+        height, width = (-side % self.size_multiple for side in gbuffer.shape[2:])
+        return F.pad(gbuffer, (0, width, 0, height)) if height or width else gbuffer
+
     def on_curve(self, gbuffer: Tensor) -> Tensor:
         """(N, C, H, W) to the answer on the transfer curve (N, outputs, H, W): what is learnt."""
         image: Tensor = self.network(self._seen(gbuffer)).float()
@@ -78,11 +84,12 @@ class Shader(nn.Module):
     def compared(self, image: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
         """What `on_curve` gave and the reference (N, outputs, H, W), as losses compare them.
 
-        Light that passed linearly is exposed as when it is judged, each picture by its reference;
-        what would be clipped then is bent instead, so that it still teaches.
+        Light is exposed as when it is judged, each picture by its reference; what would be clipped
+        then is bent instead, so that it still teaches.
         """
-        if not self.network.linear:
+        if not self.effect.is_light:
             return image, self.curve(reference)
+        image = transfer.inverse(image, self.transfer, torch)
         flat = reference.flatten(1)
         white = torch.quantile(flat, 0.99, dim=1)
         white = torch.where(white > _BLACK, white, flat.amax(1).clamp_min(_BLACK))
