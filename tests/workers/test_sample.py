@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -69,15 +70,17 @@ def test_every_effect_of_the_table_or_a_list_of_those_there_are(tmp_path: Path) 
 
 @pytest.fixture
 def trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """An effect without a reference gets a file, which answers with the light it was handed."""
-    effect = next(
-        e for e in EFFECTS if e not in references.known() and "light" in EFFECTS[e].inputs
-    )
+    """An effect gets a file of its own, which answers with the light it was handed."""
+    effect = next(e for e in EFFECTS if "light" in EFFECTS[e].inputs)
     (tmp_path / f"{effect}.py").write_text(
         "def reference(scene, view, hits, images, *, samples, seed):\n"
         "    return images['light'] * view.radius, 0 * images['light']\n"
     )
-    monkeypatch.setattr(references, "__path__", [*references.__path__, str(tmp_path)])
+    # First, and imported anew, in case there is a reference; the test's end brings that back.
+    monkeypatch.setattr(references, "__path__", [str(tmp_path), *references.__path__])
+    module = f"{references.__name__}.{effect}"
+    monkeypatch.setitem(sys.modules, module, references)
+    monkeypatch.delitem(sys.modules, module)
     return effect
 
 
