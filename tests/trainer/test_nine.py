@@ -17,6 +17,7 @@ from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.evaluation import evaluate
 from deepshade_trainer.export import load_shader
 from deepshade_trainer.networks import Shader, build, from_bundle
+from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
 
 from .synthetic import RADIUS, arrays, make_bundle, small, write_data
@@ -46,6 +47,37 @@ def test_a_batch_has_the_channels_of_its_network(effect: str, name: str, tmp_pat
     whole = data.gbuffer(data.load(0), RADIUS)
     assert whole.shape == (3 if runs else 1, channels, 64, 64)
     assert np.isfinite(whole).all()
+
+
+@pytest.mark.parametrize("runs", [False, True])
+@pytest.mark.parametrize("effect", [name for name, row in EFFECTS.items() if row.per_channel])
+def test_a_batch_made_on_the_device_is_the_same(
+    effect: str, runs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Turned alike, the same channels; the depth's median may see other pixels when turned."""
+    for share in ("HALF_LENGTHS", "SHORT_DIRECTIONS"):
+        for module in ("dataset", "resident"):
+            monkeypatch.setattr(f"deepshade_trainer.{module}.{share}", 0.0)
+    folders = [write_data(tmp_path, effect)]
+    plain = Dataset(folders, effect, per_channel=runs)
+    kept = Resident(folders, effect, per_channel=runs, device=torch.device("cpu"))
+    for seed in range(4):
+        ours, theirs = (
+            data.batch([0, 1, 2], np.random.default_rng(seed)) for data in (kept, plain)
+        )
+        assert torch.equal(ours[1], theirs[1])
+        assert torch.allclose(ours[0], theirs[0], rtol=0.05)
+
+
+def test_batches_made_on_the_device_repeat(tmp_path: Path) -> None:
+    """With its shortened directions: whatever torch drew in between."""
+    effect = next(name for name, row in EFFECTS.items() if "normal" in row.inputs)
+    folders = [write_data(tmp_path, effect)]
+    kept = Resident(folders, effect, per_channel=False, device=torch.device("cpu"))
+    first = [kept.batch([0, 1], np.random.default_rng(seed))[0] for seed in range(8)]
+    torch.rand(3)
+    again = [kept.batch([0, 1], np.random.default_rng(seed))[0] for seed in range(8)]
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
 
 
 @pytest.mark.slow

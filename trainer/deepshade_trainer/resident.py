@@ -54,9 +54,12 @@ class Resident(Dataset):
                     place = self._places[name]
                     gbuffer[place] = gbuffer[place].half().float()
             if rng.random() < SHORT_DIRECTIONS:
+                # A generator of its own: a step's batch depends on the step alone.
+                noise = torch.Generator(self.device).manual_seed(int(rng.integers(2**63)))
                 for name in directions(effect.inputs):
                     shape = (1, *gbuffer.shape[1:])
-                    factors = torch.rand(shape, device=self.device) * (1 - MIN_DIRECTION)
+                    factors = torch.rand(shape, generator=noise, device=self.device)
+                    factors = factors * (1 - MIN_DIRECTION)
                     gbuffer[self._places[name]] *= factors + MIN_DIRECTION
             if self._channels:
                 channel = int(rng.integers(3))
