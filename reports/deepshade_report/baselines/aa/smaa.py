@@ -72,20 +72,39 @@ def methods(quick: bool) -> list[Filter]:
 
 def _shade(lit: Lit, kind: str, threshold: float, steps: int, diagonal: int, *given: float) -> Any:
     factor, contrast, rounding = given
-    least = dr.opaque(mi.Float, threshold * factor)
+    edges = _detected(lit, kind, threshold * factor, contrast)
+    where = dr.compress(edges != 0)
+    if not len(where):
+        return lit.light
+    return _blended(lit, edges, where, diagonal_areas(), steps, diagonal, 1 - rounding)
+
+
+# Passes are recorded once and replayed: to trace them for each frame took longer than some of them.
+@dr.freeze
+def _detected(lit: Lit, kind: str, threshold: float, contrast: float) -> Any:
+    """Each pixel's edges to the left and above, WEST and NORTH."""
+    least = dr.opaque(mi.Float, threshold)
     if kind == "depth":
-        edges = _depth_edges(lit, least)
-    else:
-        seen = encoded(lit)
-        if kind == "luma":
-            seen = luma(seen)
-        dr.eval(seen)
-        edges = _edges(lit.grid, seen, least, dr.opaque(mi.Float, contrast))
-    dr.eval(edges)
-    shifts = Edges(lit.grid, edges)
+        return _depth_edges(lit, least)
+    seen = encoded(lit)
+    if kind == "luma":
+        seen = luma(seen)
+    dr.eval(seen)
+    return _edges(lit.grid, seen, least, dr.opaque(mi.Float, contrast))
+
+
+@dr.freeze
+def _blended(
+    lit: Lit, edges: Any, where: Any, table: Any, steps: int, diagonal: int, keep: float
+) -> Any:
+    """The picture, from edges and the indices of the pixels that have any."""
     counts = dr.opaque(mi.Int32, steps), dr.opaque(mi.Int32, diagonal)
-    keep = dr.opaque(mi.Float, 1 - rounding)
-    weights = _weights(shifts, diagonal_areas(), *counts, keep)
+    index = mi.Int32(where)
+    found = _weights(
+        Edges(lit.grid, edges), table, *lit.grid.place(index), *counts, dr.opaque(mi.Float, keep)
+    )
+    weights = dr.zeros(mi.Vector4f, dr.width(edges))
+    dr.scatter(weights, found, where)
     dr.eval(weights)
     return _blend(lit, weights)
 
@@ -140,9 +159,10 @@ class Edges:
         return (dr.gather(mi.UInt32, self.bits, index, inside) & bit) != 0
 
 
-def _weights(edges: Edges, table: Any, steps: Any, diagonal: Any, keep: Any) -> Any:
+def _weights(
+    edges: Edges, table: Any, column: Any, row: Any, steps: Any, diagonal: Any, keep: Any
+) -> Any:
     """How much of the pixels across it an edge blends: NORTH's to this and above, WEST's alike."""
-    column, row = edges.grid.pixels()
     north, west = (edges.at(column, row, bit) for bit in (NORTH, WEST))
     slanted = _diagonals(edges, table, column, row, north & (diagonal > 0), west, diagonal)
     found = slanted[0] + slanted[1] > 0
