@@ -14,6 +14,8 @@ from deepshade_report.view import Float, View
 from .plates import noise, plates
 
 try:
+    import drjit as dr
+
     from deepshade_report.baselines.aa import areas, cmaa2, fxaa, smaa
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
     pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
@@ -108,6 +110,16 @@ def test_exposure_changes_nothing(method: Any) -> None:
     assert two == pytest.approx(1024 * one, rel=1e-4)
     assert one.min() >= light.min() * 0.999
     assert one.max() <= light.max() * 1.001
+
+
+@pytest.mark.parametrize("make", [smaa.TUNABLE, cmaa2.TUNABLE, fxaa.TUNABLE])
+def test_what_was_recorded_for_one_view_shades_another(make: Any) -> None:
+    method, depth = make.make(make.published), np.ones((32, 48))
+    shaded(method, plates("aa", light=noise(seed=1), depth=depth))
+    replayed = shaded(method, plates("aa", light=noise(seed=2), depth=depth))
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        traced = shaded(method, plates("aa", light=noise(seed=2), depth=depth))
+    assert replayed == pytest.approx(traced, rel=1e-5)
 
 
 def test_areas_along_diagonals_are_what_counting_finds() -> None:

@@ -54,13 +54,22 @@ def light(planes: Float) -> Any:
 
 def plain(plane: Float) -> Any:
     """(H, W) on the device; what isn't finite is 0."""
-    return mi.Float(np.nan_to_num(plane, posinf=0.0, neginf=0.0).astype(np.float32).ravel())
+    values = mi.Float(np.nan_to_num(plane, posinf=0.0, neginf=0.0).astype(np.float32).ravel())
+    # A copy: NumPy's own memory may not be aligned, and then kernels differ from view to view.
+    values = values * dr.opaque(mi.Float, 1)
+    dr.eval(values)
+    return values
 
 
 def downloaded(image: Any, shape: tuple[int, int]) -> Float:
     """(3, H, W) of a colour on the device."""
     result: Float = image.numpy().reshape(3, *shape)
     return result
+
+
+def number(value: float) -> Any:
+    """A number on the device: no constant of what is compiled with it."""
+    return dr.opaque(mi.Float, value)
 
 
 def gradient_noise(column: Any, row: Any) -> Any:

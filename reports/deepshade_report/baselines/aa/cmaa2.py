@@ -18,7 +18,7 @@ from typing import Any
 import drjit as dr
 
 from deepshade_report.baselines.aa.seen import Lit, upload
-from deepshade_report.baselines.picture import Filter, Grid, mi
+from deepshade_report.baselines.picture import Filter, Grid, mi, number
 from deepshade_report.tuning import Ranges, Tunable, tuned
 
 RIGHT, BELOW, LEFT, ABOVE = 1, 2, 4, 8  # bits of a pixel's edges
@@ -73,30 +73,29 @@ def methods(quick: bool) -> list[Filter]:
 
 def _shade(lit: Lit, kind: str, threshold: float, *given: float) -> Any:
     factor, contrast, blur = given
-    bits, is_corner = _detected(lit, kind, threshold * factor, contrast)
+    bits, is_corner = _detected(lit, kind, number(threshold * factor), number(contrast))
     corners = dr.compress(is_corner)
-    return _blended(lit, bits, corners, blur) if len(corners) else lit.light
+    return _blended(lit, bits, corners, number(blur)) if len(corners) else lit.light
 
 
-# Passes are recorded once and replayed: to trace them for each frame takes longer than some of them.
+# Passes are recorded once and replayed: to trace them for each frame takes longer than some do.
 @dr.freeze
-def _detected(lit: Lit, kind: str, threshold: float, contrast: float) -> tuple[Any, Any]:
+def _detected(lit: Lit, kind: str, threshold: Any, contrast: Any) -> tuple[Any, Any]:
     """Each pixel's edges, and whether it has a corner."""
     seen = dr.sqrt(dr.clip(lit.light * lit.factor, 0, 1))  # the source's curve
     if kind == "luma":
         seen = _luma(seen)
     dr.eval(seen)
-    limits = dr.opaque(mi.Float, threshold), dr.opaque(mi.Float, contrast)
-    half = _edges(lit.grid, seen, *limits)
+    half = _edges(lit.grid, seen, threshold, contrast)
     dr.eval(half)
     return _all_edges(lit.grid, half)
 
 
 @dr.freeze
-def _blended(lit: Lit, bits: Any, corners: Any, blur: float) -> Any:
+def _blended(lit: Lit, bits: Any, corners: Any, blur: Any) -> Any:
     """The picture, from all edges and the indices of the corners."""
     sums = Sums(lit.grid)
-    _blend(Shapes(lit.grid, bits, lit.light), sums, corners, dr.opaque(mi.Float, blur))
+    _blend(Shapes(lit.grid, bits, lit.light), sums, corners, blur)
     return sums.mean(lit.light)
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import drjit as dr
 
 from deepshade_report.baselines.aa.seen import Lit, encoded, luma, upload
-from deepshade_report.baselines.picture import Filter, Grid, mi
+from deepshade_report.baselines.picture import Filter, Grid, mi, number
 from deepshade_report.tuning import Ranges, Tunable, tuned
 
 # by preset, the steps in pixels that a search goes
@@ -61,7 +61,8 @@ def methods(quick: bool) -> list[Filter]:
 
 
 def _shade(lit: Lit, preset: int, *given: float) -> Any:
-    return _filtered(lit, _reached(preset), len(STEPS[preset]), *given)
+    count = dr.opaque(mi.UInt32, len(STEPS[preset]))
+    return _filtered(lit, _reached(preset), count, *(number(value) for value in given))
 
 
 @lru_cache
@@ -72,11 +73,10 @@ def _reached(preset: int) -> Any:
 
 # Recorded once and replayed: to trace it for each frame took a tenth of the time.
 @dr.freeze
-def _filtered(lit: Lit, reached: Any, steps: int, *given: float) -> Any:
+def _filtered(lit: Lit, reached: Any, count: Any, *given: Any) -> Any:
     seen = luma(encoded(lit))
     dr.eval(seen)
-    count = dr.opaque(mi.UInt32, steps)
-    return _filter(lit, seen, reached, count, *(dr.opaque(mi.Float, value) for value in given))
+    return _filter(lit, seen, reached, count, *given)
 
 
 @dr.syntax
