@@ -34,9 +34,9 @@ class Grid:
 
     def pixels(self) -> tuple[Any, Any]:
         """Column and row of every pixel."""
-        return self.place(dr.arange(mi.Int32, self.shape[0] * self.shape[1]))
+        return self.coordinates(dr.arange(mi.Int32, self.shape[0] * self.shape[1]))
 
-    def place(self, index: Any) -> tuple[Any, Any]:
+    def coordinates(self, index: Any) -> tuple[Any, Any]:
         """Column and row of pixels by their index."""
         row = index // self.width
         return index - row * self.width, row

@@ -188,7 +188,7 @@ class Sums:
 
 def _blend(shapes: Shapes, sums: Sums, corners: Any, blur: Any) -> None:
     """Add what all shapes that start in corners blend."""
-    column, row = shapes.grid.place(mi.Int32(corners))
+    column, row = shapes.grid.coordinates(mi.Int32(corners))
     here = shapes.at(column, row)
     left, right = shapes.at(column - 1, row), shapes.at(column + 1, row)
     above, below = shapes.at(column, row - 1), shapes.at(column, row + 1)

@@ -98,7 +98,7 @@ def _blended(
     lit: Lit, edges: Any, where: Any, table: Any, steps: Any, diagonal: Any, keep: Any
 ) -> Any:
     """The picture, from edges and the indices of the pixels that have any."""
-    place = lit.grid.place(mi.Int32(where))
+    place = lit.grid.coordinates(mi.Int32(where))
     found = _weights(Edges(lit.grid, edges), table, *place, steps, diagonal, keep)
     weights = dr.zeros(mi.Vector4f, dr.width(edges))
     dr.scatter(weights, found, where)
