@@ -62,6 +62,7 @@ class Carrier(Network):
     """
 
     linear = True
+    rounded = "trunk."
 
     def __init__(self, config: CarrierConfig) -> None:
         super().__init__()
