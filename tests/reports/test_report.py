@@ -26,6 +26,7 @@ from deepshade_report.method import Network
 from deepshade_report.sections import Point, Skipped, frontier, points, same_time, summary
 from deepshade_report.view import body, load_views, resized
 
+from .plates import plates
 from .small import SIZE, write_bundle, write_data
 
 
@@ -138,6 +139,17 @@ def test_bodies_hold_the_view_at_any_size_and_compress_like_real_ones(root: Path
     for axis, plane in zip("XYZ", position, strict=True):
         assert np.allclose(image[f"position.{axis}"], plane, rtol=4e-3, atol=1e-6)
     assert len(grained) > 2 * len(body(view, 300, 400))
+
+
+def test_a_body_keeps_what_is_infinitely_far() -> None:
+    depth = np.full((9, 12), 3.0)
+    depth[:4] = np.inf
+    motion = np.full((2, 9, 12), 1e6)
+    view = plates("mb", depth=depth, motion=motion, light=np.full((9, 12), 1e6))
+    image = exr.read(body(view, 9, 12)).pixels
+    assert (image["Z"] == depth).all()
+    assert np.isfinite(image["motion.U"]).all()
+    assert np.isfinite(image["light.R"]).all()
 
 
 def made_up() -> dict[str, Any]:
