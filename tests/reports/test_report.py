@@ -141,6 +141,16 @@ def test_bodies_hold_the_view_at_any_size_and_compress_like_real_ones(root: Path
     assert len(grained) > 2 * len(body(view, 300, 400))
 
 
+def test_the_floor_is_what_noise_in_the_reference_leaves() -> None:
+    truth, rng = np.full((3, 64, 64), 2.0, np.float32), np.random.default_rng(5)
+    error = np.full_like(truth, 0.01)
+    noisy = truth + error * rng.standard_normal(truth.shape, np.float32)
+    view = plates("mb", depth=np.ones((64, 64)), motion=np.ones((2, 64, 64)), light=truth)
+    assert view.floor() is None
+    view = dataclasses.replace(view, reference=noisy, error=error)
+    assert view.floor() == pytest.approx(view.dssim(truth), rel=0.1)
+
+
 def test_a_body_keeps_what_is_infinitely_far() -> None:
     depth = np.full((9, 12), 3.0)
     depth[:4] = np.inf
