@@ -79,7 +79,7 @@ def load_gbuffer(
     A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
     (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
     comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
-    What isn't there, or is to be made `anew`, is derived (`derivation`): `GBuffer.derived` says how.
+    What isn't there, or is to be `anew`, is derived (`derivation`): `GBuffer.derived` says how.
     `headers` are what `exr.read_header` gave for the same sources, to spare reading them again.
 
     Raises ImageError, DamagedImageError, LimitError, MissingAttributeError,
