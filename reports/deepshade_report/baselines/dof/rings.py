@@ -65,7 +65,7 @@ RANGES: Ranges = {
     "jitter": (0.0, 1.0),
     "coarse": (-1.0, 1.0),
     "split": (0.5, 6.0),
-    "longest": (24.0, 40.0),
+    "longest": (24.0, 64.0),
 }
 
 
