@@ -60,7 +60,7 @@ class Parameters:
 
 PUBLISHED = Parameters()
 RANGES: Ranges = {
-    "sharp": (0.2, 1.5),
+    "sharp": (0.0, 1.5),
     "fade": (0.2, 2.0),
     "jitter": (0.0, 1.0),
     "coarse": (-1.0, 1.0),
