@@ -236,7 +236,7 @@ def _short(value: float | None) -> str:
 
 
 def _ms(point: Point) -> str:
-    return f"{point.milliseconds:.3g}" if point.milliseconds < 1000 else "over 1000"
+    return f"{point.milliseconds:.3g}" if point.milliseconds < 100 else f"{point.milliseconds:.0f}"
 
 
 def _scene(view: View) -> str:
