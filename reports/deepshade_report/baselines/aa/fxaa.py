@@ -41,7 +41,7 @@ class Parameters:
 PUBLISHED = Parameters()
 RANGES: Ranges = {
     "subpixel": (0.0, 1.0),
-    "threshold": (0.03, 0.333),
+    "threshold": (0.005, 0.333),
     "darkest": (0.0, 0.0833),
 }
 

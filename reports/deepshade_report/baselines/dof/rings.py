@@ -60,12 +60,12 @@ class Parameters:
 
 PUBLISHED = Parameters()
 RANGES: Ranges = {
-    "sharp": (0.2, 1.5),
+    "sharp": (0.0, 1.5),
     "fade": (0.2, 2.0),
     "jitter": (0.0, 1.0),
     "coarse": (-1.0, 1.0),
     "split": (0.5, 6.0),
-    "longest": (24.0, 40.0),
+    "longest": (24.0, 64.0),
 }
 
 

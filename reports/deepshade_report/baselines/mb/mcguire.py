@@ -43,7 +43,7 @@ RANGES: Ranges = {
     "extent": (0.002, 0.2),
     "centre": (0.1, 4.0),
     "jitter": (0.0, 1.0),
-    "tile": (32, 64),
+    "tile": (16, 64),
 }
 
 
