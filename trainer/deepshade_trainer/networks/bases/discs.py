@@ -57,8 +57,8 @@ class Discs(Bases):
         coverage = torch.tensor([1.0, 0, 0, 0]).repeat(2)  # (8,)
         light = torch.cat([torch.zeros(1, 3), torch.eye(3)]).repeat(2, 1)
         kernels = {
-            "sides": torch.tensor([-0.5, 0.5])[None, None, :, None, None],
-            "least": torch.tensor([0, _FAINT])[None, None, :, None, None],
+            "sides": torch.tensor([-0.5, 0.5])[None, :, None, None],
+            "least": torch.tensor([0, _FAINT])[None, :, None, None],
             "side": _pooling(side),
             "both": _pooling(torch.ones(8, 2)),
             "light": _pooling(light),
@@ -76,8 +76,8 @@ class Discs(Bases):
         """See `Bases.features`."""
         focal, light = gbuffer[:, :1], gbuffer[:, 1:]
         # (N, 1, 2, H, W), before and behind the focus: engines would pad 2 channels to 8
-        radius = F.relu(focal[:, :, None] * self.sides)
-        share = torch.maximum((radius / _RADII[0]).clamp(max=1), self.least)
+        radius = F.relu(focal[:, None] * self.sides[:, None])
+        share = torch.maximum((radius / _RADII[0]).clamp(max=1), self.least[:, None])
         share, outer = share.flatten(1, 2), (share * radius).flatten(1, 2)  # (N, 2, H, W)
         blurred = focal.abs() * (0.5 / _RADII[0])
         # All from here on is (N, 8, H / 2, W / 2). A cell's light is of both sides, where it has.
