@@ -110,11 +110,11 @@ class Discs(Bases):
         strong = _twice(strong)
         # Before the focus all adds up; behind it, what is blurred less is nearer and lies over.
         layers = mild + strong * (1 - F.conv2d(mild, self.over).clamp(max=1))
-        # What a near surface hides, where it is blurred by more than what it is sampled at.
+        # What a near surface hides. In one that reaches into the focus, nothing shows through.
         other = light * (1 + focal * (0.5 / _RADII[0])).clamp(0, 1)
         other = F.conv2d(other, self.light, stride=2) + (1 - cover) * self.first
         hidden = _twice(_spread(F.avg_pool2d(other, 2)[:, :4], self.hidden))
-        seen = (reach[:, :1] / 4 - 1).clamp(0, 1) * cover[:, :1] * (1 - layers[:, 4:5]).clamp_min(0)
+        seen = (reach[:, :1] / 2 - 1).clamp(0, 1) * cover[:, :1] * (1 - layers[:, 4:5]).clamp_min(0)
         hidden = hidden * (seen / hidden[:, :1].clamp_min(1e-6))
         told = torch.cat([layers[:, ::4], cover[:, ::4], reach[:, ::4] / _RADII[-1]], 1)
         return told.clamp(max=2), (light, blurred, layers, hidden)
@@ -126,10 +126,10 @@ class Discs(Bases):
         near, far = torch.split(layers, 4, 1)
         left = 1 - near[:, :1].clamp(max=1)
         total = near * gains[0] + far * (left * gains[1]) + hidden * (left * gains[2])
+        left, total, colour = torch.split(_twice(torch.cat([left, total], 1)), [1, 1, 3], 1)
         # nowhere 0: where nothing else is, there is what is faint
-        smooth = _twice(torch.cat([left, total[:, 1:] / total[:, :1]], 1))
-        sharp = (1 - blurred).clamp_min(0) * smooth[:, :1]
-        return smooth[:, 1:] + (light - smooth[:, 1:]) * sharp
+        smooth = colour / total
+        return smooth + (light - smooth) * ((1 - blurred).clamp_min(0) * left)
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
