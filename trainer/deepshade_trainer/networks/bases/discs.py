@@ -29,9 +29,9 @@ class Discs(Bases):
     the share of the lens that it covers. The classical answer lays the near side over what is
     in focus and that over the far side (layered depth of field: Scofield, "2½-D Depth-of-Field
     Simulation for Computer Animation", 1992; near and far fields: Jimenez, "Next Generation Post
-    Processing in Call of Duty: Advanced Warfare", 2014), each by its coverage. What the edge of a near surface shows through, but hides
-    from the pinhole, is continued from around. Three weights change how much the near side, the
-    far side and what is continued count.
+    Processing in Call of Duty: Advanced Warfare", 2014), each by its coverage. What a near surface
+    hides from the pinhole and shows through its edge is continued from around. Three weights
+    change how much the near side, the far side and what is continued count.
 
     What is blurred is composited at half resolution and enlarged once. Its eight channels are
     coverage and premultiplied light of the near side, then of the far side: engines keep eight
@@ -135,7 +135,9 @@ class Discs(Bases):
         """See `Network.receptive_field`."""
         half = doubled((pixel, pixel))
         mild, strong = (
-            max(self.get_buffer(f"disc{r:g}").shape[-1] // 2 for r in _RADII[1:] if (r > _HALF) == s)
+            max(
+                self.get_buffer(f"disc{r:g}").shape[-1] // 2 for r in _RADII[1:] if (r > _HALF) == s
+            )
             for s in (False, True)
         )
         quarter = grown(doubled(half), strong)
