@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from deepshade_trainer.networks.bases.discs import Discs
+from deepshade_trainer.networks.carrier import Carrier, CarrierConfig
 
 
 def _shaded(gbuffer: Tensor, weight: float = 0.0) -> Tensor:
@@ -125,3 +126,21 @@ def test_tiles_equal_the_whole() -> None:
     inside = slice(first - begin, last + 1 - begin)
     whole = _shaded(gbuffer)[:, :, first : last + 1, first : last + 1]
     torch.testing.assert_close(tile[:, :, inside, inside], whole, atol=1e-5, rtol=1e-5)
+
+
+def test_tiles_with_a_halo_equal_the_whole_through_the_network() -> None:
+    """Weights are of cells of 2 x 2 pixels here."""
+    torch.manual_seed(0)
+    shape = {"widths": (8, 8), "steps": (2,), "down": (1, 1), "up": (1,)}
+    network = Carrier(CarrierConfig(bases="discs", **shape)).eval()
+    torch.nn.init.normal_(network.trunk.head.weight, std=0.3)
+    step = network.size_multiple
+    halo = -(-network.halo // step) * step
+    gbuffer = _random(2 * halo + 2 * step, 2 * halo + 2 * step)
+    with torch.inference_mode():
+        whole = network(gbuffer)
+        tile = network(gbuffer[:, :, step:, step:])
+    first = halo + step
+    assert first < whole.shape[2]
+    difference = tile[:, :, halo:, halo:] - whole[:, :, first:, first:]
+    assert difference.abs().max() < 1e-5
