@@ -92,7 +92,9 @@ class Filter:
     """A screen-space Method: `upload` puts a view on the device, `kernel` shades it.
 
     The kernel is given what was uploaded, the settings' values and the parameters', and returns
-    a plane, or the picture's colour, on the device.
+    a plane, or the picture's colour, on the device. A `recorded` kernel is traced once a view: for
+    every frame that takes Python longer than many a frame does. It may make no arrays from numbers
+    of Python.
     """
 
     family = "screen-space"
@@ -104,7 +106,11 @@ class Filter:
         parameters: Any,
         upload: Callable[[View], Any],
         kernel: Callable[..., Any],
+        *,
+        recorded: bool = False,
     ) -> None:
+        if recorded:
+            kernel = dr.freeze(kernel, limit=4, warn_after=1 << 30)
         self.name, self.settings, self.parameters = name, settings, parameters
         self._upload, self._kernel = upload, kernel
         self._frame: Any = None

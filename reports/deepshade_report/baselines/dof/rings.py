@@ -72,7 +72,9 @@ RANGES: Ranges = {
 def rings(count: int, half: bool, parameters: Parameters | None = None) -> Filter:
     """The gather as a Method, with the parameters that were tuned or those given."""
     parameters = parameters or Parameters(**tuned(__package__, "rings"))
-    return Filter("ring gather", {"rings": count, "half": half}, parameters, upload, _shade)
+    return Filter(
+        "ring gather", {"rings": count, "half": half}, parameters, upload, _shade, recorded=True
+    )
 
 
 TUNABLE = Tunable(partial(rings, 4, False), PUBLISHED, RANGES)

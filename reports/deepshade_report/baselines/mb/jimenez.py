@@ -58,7 +58,7 @@ RANGES: Ranges = {
 def jimenez(pairs: int, parameters: Parameters | None = None) -> Filter:
     """The filter as a Method, with the parameters that were tuned or those given."""
     parameters = parameters or Parameters(**tuned(__package__, "jimenez"))
-    return Filter("Jimenez", {"pairs": pairs}, parameters, upload, _shade)
+    return Filter("Jimenez", {"pairs": pairs}, parameters, upload, _shade, recorded=True)
 
 
 TUNABLE = Tunable(partial(jimenez, 8), PUBLISHED, RANGES)

@@ -50,7 +50,7 @@ RANGES: Ranges = {
 def mcguire(taps: int, parameters: Parameters | None = None) -> Filter:
     """The filter as a Method, with the parameters that were tuned or those given."""
     parameters = parameters or Parameters(**tuned(__package__, "mcguire"))
-    return Filter("McGuire", {"taps": taps}, parameters, upload, _shade)
+    return Filter("McGuire", {"taps": taps}, parameters, upload, _shade, recorded=True)
 
 
 TUNABLE = Tunable(partial(mcguire, 15), PUBLISHED, RANGES)
