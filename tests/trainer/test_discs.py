@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -76,6 +77,15 @@ def test_an_object_in_focus_has_clean_edges_before_a_sky(
     """Every ray through a sky pixel passes the object: both stay as they are, up to the edge."""
     gbuffer = _halves((0.0, dark), (blur, bright))
     assert (_shaded(gbuffer) - gbuffer[:, 1:]).abs().max() < 1
+
+
+@pytest.mark.parametrize("focal", [-1.0, -0.3, 0.3, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("blur", [16.0, 48.0])
+def test_no_sky_shines_through_what_is_almost_in_focus(focal: float, blur: float) -> None:
+    """Two pixels inside the edge of a wall its own circles are all that reach."""
+    image = _shaded(_halves((focal, 1.0), (blur, 1e4)))[0, 0, 32]
+    inside = len(image) // 2 - 3
+    assert image[:inside] == pytest.approx(np.ones(inside), abs=0.1)
 
 
 @pytest.mark.parametrize(("dark", "bright"), [(0.0, 100.0), (100.0, 0.0)])

@@ -19,6 +19,7 @@ _HALF = 5.0
 _SOFT, _SOFTER = 16 / 3, 24.0
 _HIDDEN = 10.0  # over about which radius what a near surface hides is continued
 _FAINT = 1e-4  # how much a sharp pixel counts in the blurred picture, so that it has no holes
+_CLOSED = 1e-6  # how much shows through what covers all, so that nothing divides by 0
 _SURE = 4.0  # weights end at e^±4
 
 
@@ -52,6 +53,9 @@ class Discs(Bases):
     one: Tensor
     first: Tensor
     over: Tensor
+    open: Tensor
+    before: Tensor
+    far: Tensor
     hidden: Tensor
 
     def __init__(self) -> None:
@@ -68,6 +72,9 @@ class Discs(Bases):
             "one": _pooling(coverage[:, None].repeat(1, 2)),
             "first": coverage[None, :, None, None],
             "over": (side[:, 1:] * side[:, 1] * coverage)[:, :, None, None],
+            "open": (side[:, 1:] * coverage)[:, :, None, None],
+            "before": side[:, 0],
+            "far": side[:, 1][None, :, None, None],
         }
         kernels["hidden"] = _discs(_HIDDEN / 4, 4)
         for radius in _RADII[1:]:
@@ -101,20 +108,27 @@ class Discs(Bases):
             return lit * torch.minimum(rise, fall).clamp(0, 1)
 
         mild, strong = layer(0), torch.zeros(())
+        # Before the focus all adds up. Behind it, what is blurred less is nearer and lies over the
+        # rest: what is sharp over all, the least blurred over what is two radii on.
+        # Through what reaches into the focus nothing shows, but through a wide near surface.
+        wide = torch.maximum((reach / _RADII[0] - 1).clamp(0, 1), self.far) * cover
+        share = F.conv2d(wide, self.open, self.before)
+        layers, under = mild * share, share - F.conv2d(mild, self.over)
         for k, size in enumerate(_RADII[1:], 1):
-            disc = getattr(self, f"disc{size:g}")
-            if size <= _HALF:
-                mild = mild + _spread(layer(k), disc)
-            else:
-                strong = strong + _spread(F.avg_pool2d(layer(k), 2), disc)
-        strong = _twice(strong)
-        # Before the focus all adds up; behind it, what is blurred less is nearer and lies over.
-        layers = mild + strong * (1 - F.conv2d(mild, self.over).clamp(max=1))
-        # What a near surface hides. In one that reaches into the focus, nothing shows through.
+            spread = getattr(self, f"disc{size:g}")
+            if size > _HALF:
+                strong = strong + _spread(F.avg_pool2d(layer(k), 2), spread)
+                continue
+            more = _spread(layer(k), spread)
+            layers = layers + more * (share if k == 1 else under.clamp(_CLOSED, 1))
+            mild = mild + more
+        under = share - F.conv2d(mild, self.over)
+        layers = layers + _twice(strong) * under.clamp(_CLOSED, 1)
+        # What a near surface hides.
         other = light * (1 + focal * (0.5 / _RADII[0])).clamp(0, 1)
         other = F.conv2d(other, self.light, stride=2) + (1 - cover) * self.first
         hidden = _twice(_spread(F.avg_pool2d(other, 2)[:, :4], self.hidden))
-        seen = (reach[:, :1] / 2 - 1).clamp(0, 1) * cover[:, :1] * (1 - layers[:, 4:5]).clamp_min(0)
+        seen = wide[:, :1] * (1 - layers[:, 4:5]).clamp_min(0)
         hidden = hidden * (seen / hidden[:, :1].clamp_min(1e-6))
         told = torch.cat([layers[:, ::4], cover[:, ::4], reach[:, ::4] / _RADII[-1]], 1)
         return told.clamp(max=2), (light, blurred, layers, hidden)
