@@ -192,7 +192,7 @@ class Bounces(Bases):
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        # The two nearest cells, from which it is up-sampled, and those that these are smoothed with.
+        # The two nearest cells, from which it is up-sampled, and those they are smoothed with.
         first = (pixel - CELL // 2) // CELL
         cells = grown((first, first + 1), 1)
         reach = max(
