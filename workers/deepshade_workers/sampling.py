@@ -90,4 +90,6 @@ def stratified_mean(
         squares += difference * difference
         before = value
         index += 1
-    return mean / total, dr.sqrt(squares) / total
+    found = mean / total, dr.sqrt(squares) / total
+    dr.eval(found)  # in one kernel: one after the other they would trace every ray twice
+    return found
