@@ -11,15 +11,16 @@ what noise is left falls with the number of rays.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
 
-from deepshade_report.baselines.gi.lit import Lit, open_lit, picture
+from deepshade_report.baselines.gi.lit import Lit, open_lit
+from deepshade_report.baselines.picture import Filter
 from deepshade_report.baselines.screen import mi
 from deepshade_report.tuning import Ranges, Tunable, tuned
-from deepshade_report.view import Float, View
 from deepshade_workers.sampling import pixel_streams, random_pair, strata
 
 # rays a pixel, as `strata` rounds them
@@ -31,44 +32,33 @@ _NEAREST = 0.02
 
 @dataclass(frozen=True)
 class Parameters:
-    """In radii of the effect: how far behind a pixel its surface still stops rays."""
+    """How far behind a pixel, in radii of the effect, its surface still stops rays."""
 
-    thickness: float = 0.2
+    thickness: float = 0.3
 
 
 PUBLISHED = Parameters()
 RANGES: Ranges = {"thickness": (0.02, 2.0)}
 
 
-class OneLayer:
-    """Marched rays as a Method."""
-
-    family = "screen-space"
-    name = "marched rays"
-
-    def __init__(self, rays: int, parameters: Parameters | None = None) -> None:
-        self.settings = {"rays": rays}
-        self.parameters = parameters or replace(PUBLISHED, **tuned(__package__, "onelayer"))
-        self._lit: Lit | None = None
-
-    def prepare(self, view: View) -> None:
-        """Put the view on the device."""
-        self._lit = open_lit(view)
-
-    def shade(self, view: View) -> Float:
-        """(3, H, W), not negative, of the prepared view; 0 in background."""
-        assert self._lit is not None
-        columns, rows = (dr.opaque(mi.UInt32, n) for n in strata(2 * self.settings["rays"]))
-        numbers = [dr.opaque(mi.Float, float(value)) for value in astuple(self.parameters)]
-        return picture(self._lit.screen, _march(self._lit, columns, rows, *numbers))
+def onelayer(rays: int, parameters: Parameters | None = None) -> Filter:
+    """Marched rays as a Method, with the parameters that were tuned or those given."""
+    parameters = parameters or replace(PUBLISHED, **tuned(__package__, "onelayer"))
+    return Filter("marched rays", {"rays": rays}, parameters, open_lit, _shade)
 
 
-TUNABLE = Tunable(lambda parameters=None: OneLayer(32, parameters), PUBLISHED, RANGES)
+TUNABLE = Tunable(partial(onelayer, QUICK[0]), PUBLISHED, RANGES)
 
 
-def methods(quick: bool) -> list[OneLayer]:
+def methods(quick: bool) -> list[Filter]:
     """The method at its numbers of rays; in a quick report, the fewest."""
-    return [OneLayer(rays) for rays in (QUICK if quick else SETTINGS)]
+    return [onelayer(rays) for rays in (QUICK if quick else SETTINGS)]
+
+
+def _shade(lit: Lit, rays: int, thickness: float) -> Any:
+    columns, rows = (dr.opaque(mi.UInt32, n) for n in strata(2 * rays))
+    image = _march(lit, columns, rows, dr.opaque(mi.Float, thickness))
+    return dr.select(lit.screen.depth > 0, image, 0)
 
 
 @dr.syntax
@@ -112,7 +102,7 @@ def _march(lit: Lit, columns: Any, rows: Any, thickness: Any) -> Any:
             delta = mi.Vector3f(x, y, -along) - screen.position(c, r, surface.w)
             normal = mi.Vector3f(surface.x, surface.y, surface.z)
             behind = (dr.dot(delta, normal) <= 0) & (along - surface.w < thickness)
-            # Beside a surface seen edge-on no tangent plane is to be trusted: depth decides, too.
+            # Planes of shading normals bend away: what lies well before a pixel isn't behind it.
             met = inside & (surface.w > 0) & behind & (along > surface.w * (1 - 1e-3))
             lights = met & (dr.dot(normal, direction) < 0)
             sent = dr.gather(mi.Vector4f, lit.light, place, lights)

@@ -1,8 +1,9 @@
 """Indirect light: what the surfaces in the picture send, gathered along rays over the picture.
 
-Around each cell of 8 x 8 pixels points are looked at in eight directions, at distances that grow
-geometrically. The sector that a point newly raises above the horizon so far it fills with its light
-(B. Mayaux, *Horizon-Based Indirect Lighting*, 2018; slices through the view as in J. Jimenez,
+Around each cell of 4 x 4 pixels points are looked at in six directions, at distances that grow
+geometrically; four neighbours take turns at both, so that the smoothing after it, along surfaces,
+sees 24 directions. The sector that a point newly raises above the horizon so far it fills with its
+light (B. Mayaux, *Horizon-Based Indirect Lighting*, 2018; slices through the view as in J. Jimenez,
 X. Wu, A. Pesce and A. Jarabo, *Practical Real-Time Strategies for Accurate Indirect Occlusion*,
 2016). A sector's ∫ ω dω has a closed form, so that a cell carries each colour's vector irradiance
 (J. Arvo, *The Irradiance Jacobian for Partially Occluded Polyhedral Sources*, 1994), and every
@@ -58,7 +59,7 @@ _ARC = (0.9943, -0.1293, -0.0776)
 # Neighbours count less by this much times the squared sine of how far off the tangent plane they
 # lie.
 _BENT = 4.0
-# By how much a cosine may differ at most for the sine of an angle between.
+# How far apart two angles' cosines may be, for the sine of what lies between them.
 _CHORD = 1.2
 _PLACES = [(ray, phase) for ray in range(RAYS) for phase in range(_PHASES)]
 
@@ -120,13 +121,12 @@ class Bounces(Bases):
         # The ray's direction square to the view is (along - view · slant) · upright.
         slant = lengthwise(view)
         upright = torch.rsqrt((1 - slant * slant).clamp_min(1e-3))
-        facing = (normal * view).sum(1, keepdim=True).clamp_min(0.02)
-        facing = _repeated(facing)
+        facing = _repeated((normal * view).sum(1, keepdim=True).clamp_min(0.02))
         leaning = (lengthwise(normal) - facing * slant) * upright
         # Cosines to the view: of the tangent plane first, of the horizon then.
         shortened = torch.rsqrt(leaning * leaning + facing * facing)
-        low = horizon = leaning * -1 * shortened
-        tangent = torch.split(_repeated(normal) * (shortened * _CHORD), 1, 1)
+        tangent = horizon = leaning * -1 * shortened
+        upward = torch.split(_repeated(normal) * (shortened * _CHORD), 1, 1)
         centre, eye = _repeated(here), torch.split(_repeated(view), 1, 1)
         told, towards, sideways, seen, close, sent = [], [], [], [], [], []
         before = horizon * 0
@@ -142,9 +142,9 @@ class Bounces(Bases):
             near = near * (distance * -_FADE + _GONE * _FADE).clamp(0, 1)
             before = distance
             cosine = _total(d * e for d, e in zip(delta, eye, strict=True)) * inverse
-            # Cells lie beside the ray: on the tangent plane nothing rises, wherever it is.
-            above = _total(d * t for d, t in zip(delta, tangent, strict=True)) * inverse
-            cosine = torch.minimum(cosine, low + F.relu(above)).clamp(-1, 1)
+            # Cells lie beside the ray; none may seem to rise above a tangent plane that it is on.
+            above = _total(d * t for d, t in zip(delta, upward, strict=True)) * inverse
+            cosine = torch.minimum(cosine, tangent + F.relu(above)).clamp(-1, 1)
             back = _total(d * n for d, n in zip(delta, torch.split(normals, 1, 1), strict=True))
             rise = F.relu(cosine + horizon * -1)
             rise = (rise + rise.clamp(max=_STEP) * 0.5) * near  # up to half-way to the next point
