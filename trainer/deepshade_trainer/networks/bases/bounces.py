@@ -148,12 +148,12 @@ class Bounces(Bases):
             back = _total(d * n for d, n in zip(delta, torch.split(normals, 1, 1), strict=True))
             rise = F.relu(cosine + horizon * -1)
             rise = (rise + rise.clamp(max=_STEP) * 0.5) * near  # up to half-way to the next point
-            rise = torch.minimum(rise, 1 - horizon)
+            rise = torch.minimum(rise, F.relu(1 - horizon))
             turned = (back * inverse).clamp(-1, 1)  # < 0: what is seen of it faces the receiver
             told += [rise, cosine * near, turned * near, distance * 0.25]
             above = horizon + rise
             towards.append(rise * (above + horizon) * 0.5)
-            sideways.append(_arc(above) + _arc(horizon) * -1)
+            sideways.append(rise * _steepness(above, horizon))
             seen.append(rise)
             close.append(near)
             sent.append(light)
@@ -222,10 +222,15 @@ def _spread(pooled: Tensor) -> list[Tensor]:
     return [means[spread] for spread in SPREADS]
 
 
-def _arc(c: Tensor) -> Tensor:
-    """∫ √(1 - c²) dc from 0, for cosines in [-1, 1]."""
-    square = c * c
-    return ((square * _ARC[2] + _ARC[1]) * square + _ARC[0]) * c
+def _steepness(a: Tensor, b: Tensor) -> Tensor:
+    """∫ √(1 - c²) dc from b to a over (a - b), for cosines in [-1, 1].
+
+    A difference of two integrals wouldn't be exactly 0 where nothing rises, and light is large.
+    """
+    product = a * b
+    square = a * a + b * b
+    both = square + product
+    return (square * both + product * product * -1) * _ARC[2] + both * _ARC[1] + _ARC[0]
 
 
 def _total(parts: Iterable[Tensor]) -> Tensor:
