@@ -1,0 +1,26 @@
+"""Environment maps: read, sampled, made, and prepared for shading.
+
+Orientation, and what lies between pixels: `environment`.
+"""
+
+from deepshade.environments.environment import (
+    LIMITS,
+    SUFFIXES,
+    Environment,
+    Up,
+    directions,
+    read_environment,
+    solid_angles,
+    world_to_map,
+)
+
+__all__ = [
+    "LIMITS",
+    "SUFFIXES",
+    "Environment",
+    "Up",
+    "directions",
+    "read_environment",
+    "solid_angles",
+    "world_to_map",
+]
