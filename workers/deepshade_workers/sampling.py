@@ -17,6 +17,8 @@ from deepshade_workers.backend import mitsuba
 
 mi = mitsuba()
 
+_BELOW_1 = 1 - 2.0**-24  # the largest float32 that is
+
 
 def random_pair(stream: Any, index: Any) -> Any:
     """Two floats in [0, 1) for sample `index` of each pixel's `stream`."""
@@ -35,6 +37,16 @@ def pixel_streams(count: int, seed: int) -> Any:
     index = dr.arange(mi.UInt32, count)
     key, _ = mi.sample_tea_32(index ^ dr.opaque(mi.UInt32, high), dr.opaque(mi.UInt32, low), 6)
     return key
+
+
+def split(number: Any, share: Any) -> tuple[Any, Any]:
+    """Whether uniform `number` in [0, 1) is below `share`, and what is left of it, uniform again.
+
+    A choice made so keeps the strata of the number within each case.
+    """
+    chosen = number < share
+    rest = dr.select(chosen, number / share, (number - share) / (1 - share))
+    return chosen, dr.clip(rest, 0, _BELOW_1)
 
 
 def strata(samples: int) -> tuple[int, int]:
