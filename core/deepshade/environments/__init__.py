@@ -13,6 +13,7 @@ from deepshade.environments.environment import (
     solid_angles,
     world_to_map,
 )
+from deepshade.environments.sky import sky
 
 __all__ = [
     "LIMITS",
@@ -21,6 +22,7 @@ __all__ = [
     "Up",
     "directions",
     "read_environment",
+    "sky",
     "solid_angles",
     "world_to_map",
 ]

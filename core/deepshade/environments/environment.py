@@ -86,7 +86,7 @@ class Environment:
             + self.radiance[:, row, columns[1]] * across
             for row in rows
         )
-        return above * (1 - down) + below * down
+        return np.asarray(above * (1 - down) + below * down, np.float32)
 
     def rotated(self, degrees: float, up: Up = "y") -> Environment:
         """The map that a y-up world sees instead: this one, turned, and laid over a world that is
@@ -123,7 +123,7 @@ def world_to_map(degrees: float = 0.0, up: Up = "y") -> NDArray[np.float64]:
     back = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
     if up == "y":
         return back
-    return back @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    return np.asarray(back @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
 
 
 def read_environment(
