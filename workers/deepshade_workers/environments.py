@@ -73,7 +73,10 @@ class EnvironmentLight:
         return found * width * height / (2 * dr.square(dr.pi) * sine)
 
     def sample(self, pair: Any) -> Any:
-        """A unit world direction, about in proportion to radiance, for uniform `pair` in [0, 1)²."""
+        """A unit world direction, about in proportion to radiance, for uniform `pair` in [0, 1)².
+
+        Where a pixel's neighbours are bright its tent reaches into them: see `density`.
+        """
         height, width = self.environment.shape
         row, down = _chosen(self._rows, 0, height, pair.y)
         column, across = _chosen(self._columns, row * width, width, pair.x)
@@ -99,13 +102,14 @@ class EnvironmentLight:
         x, y = column - 0.5, row - 0.5
         left, top = dr.floor(x), dr.floor(y)
         fx, fy = x - left, y - top
-        columns = [mi.UInt32(mi.Int32(left) + (width + k)) % width for k in (0, 1)]
-        rows = [mi.UInt32(dr.clip(mi.Int32(top) + k, 0, height - 1)) for k in (0, 1)]
-        above, below = (
-            dr.lerp(*(dr.gather(kind, table, line * width + at) for at in columns), fx)
-            for line in rows
-        )
-        return dr.lerp(above, below, fy)
+
+        def at(down: int, right: int) -> Any:
+            line = mi.UInt32(dr.clip(mi.Int32(top) + down, 0, height - 1))
+            # A turned map's columns go up to twice its width, and down to -1.
+            place = mi.UInt32(mi.Int32(left) + (width + right)) % width
+            return dr.gather(kind, table, line * width + place)
+
+        return dr.lerp(dr.lerp(at(0, 0), at(0, 1), fx), dr.lerp(at(1, 0), at(1, 1), fx), fy)
 
 
 def light_of(view: View, effect: str) -> EnvironmentLight:
@@ -122,7 +126,7 @@ def _chosen(cumulative: Any, start: Any, count: int, number: Any) -> tuple[Any, 
 
     `cumulative` holds `count` cumulative weights from `start` on.
     """
-    index = dr.binary_search(
+    index = dr.binary_search(  # type: ignore[no-untyped-call]
         0, count - 1, lambda k: dr.gather(mi.Float, cumulative, start + k) <= number
     )
     above = dr.gather(mi.Float, cumulative, start + index)

@@ -11,7 +11,7 @@ from deepshade_workers.environments import light_of
 from deepshade_workers.lighting import Phong
 from deepshade_workers.references.dof import lens_ray
 from deepshade_workers.references.ibl import reflected
-from deepshade_workers.sampling import stratified_mean
+from deepshade_workers.sampling import hypercube_mean
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, eye_of, normals_toward, offset_origin, pixel_rays
 from deepshade_workers.view import Image, Images, View
@@ -54,5 +54,5 @@ def reference(
         shaded = reflected(light, phong, valid & ~blocked, first)
         return dr.select(valid, shaded, light.radiance(ray.d))
 
-    value, error = stratified_mean(through_lens, len(hits.valid), samples, seed ^ STREAM)
+    value, error = hypercube_mean(through_lens, len(hits.valid), samples, seed ^ STREAM)
     return hits.planar(value), hits.planar(error)

@@ -62,8 +62,9 @@ def reflected(light: EnvironmentLight, phong: Phong, valid: Any, point: Any) -> 
     other = phong.frame.to_local(light.sample(mi.Point2f(x, point.y)))
     local = dr.select(bright, other, own)
     direction = phong.frame.to_world(local)
-    valid = valid & (local.z > 0)
     parts = dr.lerp(local.z * dr.inv_pi, phong.shine_density(local), share)
     density = (light.density(direction) + parts) / 2
+    # A narrow lobe's density may underflow, and f with it.
+    valid = valid & (local.z > 0) & (density > 0)
     f = phong.diffuse * dr.inv_pi + phong.shine(local)
     return dr.select(valid, f * light.radiance(direction) * local.z / density, 0)
