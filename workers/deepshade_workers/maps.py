@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade.environments import SUFFIXES, Environment, read_environment, sky, solid_angles
+from deepshade.environments import SUFFIXES, Environment, read_environment, sky
 from deepshade.errors import ConfigError
 
 # Rows of a map, at most: its file has 1.5 MB then, and a pixel is little larger than the sun.
@@ -54,20 +54,19 @@ def reduced(environment: Environment, height: int = MAX_HEIGHT) -> Environment:
     rows, columns = environment.shape
     if rows <= height:
         return environment
-    weights = _overlaps(rows, height) * solid_angles(rows, columns)
-    weights /= weights.sum(1, keepdims=True)
-    across = _overlaps(columns, 2 * height)
-    across /= across.sum(1, keepdims=True)
-    smaller = weights @ environment.radiance.astype(np.float64) @ across.T
+    # The solid angle between two rows' edges is that between their heights on the unit sphere.
+    fine, coarse = (-np.cos(np.pi * np.linspace(0, 1, n + 1)) for n in (rows, height))
+    down = _shares(fine, coarse)
+    across = _shares(np.linspace(0, 1, columns + 1), np.linspace(0, 1, 2 * height + 1))
+    smaller = down @ environment.radiance.astype(np.float64) @ across.T
     return Environment(environment.name, smaller.astype(np.float32))
 
 
-def _overlaps(many: int, few: int) -> NDArray[np.float64]:
-    """(few, many): how much of each of `many` equal parts of a line lies in each of `few`."""
-    edges = np.arange(many + 1) / many * few
-    parts = np.arange(few)[:, None]
-    shares = np.clip(np.minimum(edges[1:], parts + 1) - np.maximum(edges[:-1], parts), 0, None)
-    return np.asarray(shares)
+def _shares(fine: NDArray[np.float64], coarse: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(C, F): what share of each of C intervals lies in each of F, by their increasing edges."""
+    low, high = coarse[:-1, None], coarse[1:, None]
+    overlap = np.minimum(fine[1:], high) - np.maximum(fine[:-1], low)
+    return np.asarray(np.clip(overlap, 0, None) / (high - low))
 
 
 @lru_cache(maxsize=16)

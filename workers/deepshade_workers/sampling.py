@@ -147,7 +147,7 @@ def hypercube_mean(
         index += 1
         complete = index % each == 0
         deviation = dr.select(complete, group - mean, 0)
-        mean += deviation / mi.Float(index // each)
+        mean += deviation / mi.Float(dr.maximum(index // each, 1))
         squares += deviation * dr.select(complete, group - mean, 0)
         group = dr.select(complete, 0, group)
     return mean, dr.sqrt(squares / (GROUPS * (GROUPS - 1)))
