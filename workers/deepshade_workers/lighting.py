@@ -201,7 +201,9 @@ def direct_light(
         index += 1
     seen = sky(scene, view, -hits.surface.wi)  # where a ray hits nothing its wi is in the world
     light = dr.select(hits.valid, whole / (2 * cells), seen)
-    return hits.planar(light), hits.planar(part / (2 * cells))
+    part /= 2 * cells
+    dr.eval(light, part)  # in one kernel: else every ray would be traced twice
+    return hits.planar(light), hits.planar(part)
 
 
 def toward_camera(hits: Hits) -> Any:

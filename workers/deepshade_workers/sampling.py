@@ -111,7 +111,9 @@ def stratified_mean(
         squares += difference * difference
         before = value
         index += 1
-    return mean / total, dr.sqrt(squares) / total
+    found = mean / total, dr.sqrt(squares) / total
+    dr.eval(found)  # in one kernel: one after the other they would trace every ray twice
+    return found
 
 
 @dr.syntax
@@ -150,4 +152,6 @@ def hypercube_mean(
         mean += deviation / mi.Float(dr.maximum(index // each, 1))
         squares += deviation * dr.select(complete, group - mean, 0)
         group = dr.select(complete, 0, group)
-    return mean, dr.sqrt(squares / (GROUPS * (GROUPS - 1)))
+    error = dr.sqrt(squares / (GROUPS * (GROUPS - 1)))
+    dr.eval(mean, error)  # in one kernel
+    return mean, error
