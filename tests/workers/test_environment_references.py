@@ -283,6 +283,7 @@ def test_the_environment_blurs_as_at_infinity(ahead: Camera) -> None:
     assert_within(value[:, away], error[:, away], seen[:, away])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", [do, ibl, full])
 def test_errors_are_the_spread_of_repeated_renders(
     module: Any, corner: Scene, above: Camera
