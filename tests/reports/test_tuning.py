@@ -36,6 +36,16 @@ def test_any_change_stays_within_its_range(name: str) -> None:
     assert isinstance(base.blur, int)
 
 
+def test_a_range_that_may_be_too_narrow_is_named() -> None:
+    subject = SUBJECTS["gtao"]
+    inner = {name: sum(ends) / 2 for name, ends in subject.ranges.items()}
+    base = replace(subject.published, **inner)
+    assert tuning.at_ends(base, subject.ranges) == []
+    low, high = (replace(base, spread=end) for end in subject.ranges["spread"])
+    assert tuning.at_ends(low, subject.ranges) == ["spread 1.0"]
+    assert tuning.at_ends(high, subject.ranges) == ["spread 2.5"]
+
+
 @pytest.mark.slow
 def test_a_search_comes_near_what_the_reference_was_made_with() -> None:
     view, subject = rubble(), replace(hbao.TUNABLE, make=partial(hbao.hbao, 4, 4))

@@ -1,8 +1,4 @@
-"""What indirect light is compared with: the visibility bitmask.
-
-To tune: `python -m deepshade_report.tuning --effect gi --data DATA --out tuned.json`, on views
-apart from those that are reported; the result belongs beside this file.
-"""
+"""What indirect light is compared with: the visibility bitmask."""
 
 METHODS = {"visibility bitmask": "bitmask"}
 # Nalbach et al. 2017, table 1: milliseconds at 768 x 512 on a GTX 980 Ti, SSIM on its own test set
