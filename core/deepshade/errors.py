@@ -94,6 +94,10 @@ class DataError(DeepshadeError):
     """A data set (shards, manifest) is incomplete, damaged or of another schema."""
 
 
+class EnvironmentMapError(DeepshadeError):
+    """A picture is no environment: its shape or its values are those of no light."""
+
+
 class SceneError(DeepshadeError):
     """A scene can't be read or makes no sense."""
 

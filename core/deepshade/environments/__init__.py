@@ -1,0 +1,28 @@
+"""Environment maps: read, sampled, made, and prepared for shading.
+
+Orientation, and what lies between pixels: `environment`.
+"""
+
+from deepshade.environments.environment import (
+    LIMITS,
+    SUFFIXES,
+    Environment,
+    Up,
+    directions,
+    read_environment,
+    solid_angles,
+    world_to_map,
+)
+from deepshade.environments.sky import sky
+
+__all__ = [
+    "LIMITS",
+    "SUFFIXES",
+    "Environment",
+    "Up",
+    "directions",
+    "read_environment",
+    "sky",
+    "solid_angles",
+    "world_to_map",
+]
