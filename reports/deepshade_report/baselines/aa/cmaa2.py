@@ -53,7 +53,7 @@ class Parameters:
 
 
 PUBLISHED = Parameters()
-RANGES: Ranges = {"threshold": (0.2, 2.0), "contrast": (0.0, 0.5), "blur": (0.0, 0.3)}
+RANGES: Ranges = {"threshold": (0.02, 2.0), "contrast": (0.0, 0.5), "blur": (0.0, 0.3)}
 
 
 def cmaa2(edges: str, threshold: float, parameters: Parameters | None = None) -> Filter:
