@@ -38,7 +38,8 @@ class Bundle:
     `bytes_per_pixel` is the memory that a prediction takes for each pixel, in float32.
 
     `float32` names the tensors up to which the graph must be calculated in float32: arithmetic on
-    lengths, which 16 bits would round. `int8` maps the weights of convolutions that may be
+    lengths and light, which 16 bits would round. `float32_after` names those from which on it must
+    be again: weights that light is blended by. `int8` maps the weights of convolutions that may be
     calculated in 8 bits to the range of what they convolve, and `int8_kinds` are the kinds of CPU
     (`machine.cpu_kind`) on which that was found to add little error. `network` is the trainer's
     configuration of the network, whose weights the graph holds by their own names. `ranges` are
@@ -57,6 +58,7 @@ class Bundle:
     bytes_per_pixel: int
     per_channel: bool = False
     float32: tuple[str, ...] = ()
+    float32_after: tuple[str, ...] = ()
     int8: dict[str, tuple[float, float]] = field(default_factory=dict)
     int8_kinds: tuple[str, ...] = ()
     network: dict[str, Any] = field(default_factory=dict)
@@ -186,7 +188,7 @@ def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any])
             )
     if MODEL not in values.get("hashes", {}):
         raise BundleError(f"{where}: 'hashes' has none for {MODEL}", fix="export it again")
-    for key in ("inputs", "outputs", "float32", "int8_kinds"):
+    for key in ("inputs", "outputs", "float32", "float32_after", "int8_kinds"):
         values[key] = tuple(values.get(key, ()))
     for key in ("ranges", "int8"):
         pairs = values.get(key, {})
@@ -253,6 +255,7 @@ _CHECKS: dict[str, tuple[Any, str]] = {
     "bytes_per_pixel": (lambda v: _whole(v, 1, 1 << 24), "a whole number above 0"),
     "per_channel": (lambda v: isinstance(v, bool), "true or false"),
     "float32": (_tensors, "a list of names of the graph's tensors"),
+    "float32_after": (_tensors, "a list of names of the graph's tensors"),
     "int8": (_ranges, "pairs of numbers, lowest first"),
     "int8_kinds": (_tensors, "a list of kinds of CPU"),
     "network": (lambda v: isinstance(v, dict), "an object"),

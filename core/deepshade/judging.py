@@ -31,6 +31,16 @@ def exposed(effect: Effect, reference: Float, *images: Float) -> list[Float]:
         return [np.clip(image * factor, 0, 1) for image in images]
 
 
+def relative(reference: Float, image: Float) -> float:
+    """SMAPE of light (C, H, W), exposed as the reference is but not clipped; in [0, 1].
+
+    Raises ValueError for non-finite values.
+    """
+    factor = metrics.exposure(reference)
+    pair = (np.asarray(planes, np.float64) * factor for planes in (image, reference))
+    return metrics.smape(*pair)
+
+
 def contrast(effect: Effect, reference: Float, blank: Float) -> float:
     """How much a view shows, by the effect's measure: to be held against its `min_contrast`.
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from deepshade import tensors
 from deepshade.bundles import Bundle
-from deepshade.engines import Engine, available, load_engine
+from deepshade.engines import Engine, choose, load_engine, usable
 from deepshade.errors import DeepshadeError
 from deepshade_report.view import Float, View
 
@@ -72,9 +72,12 @@ class Network:
 
 
 def networks(served: list[Bundle], paper: Bundle | None, threads: int) -> Iterator[Network]:
-    """Every bundle on every backend that this machine has; what can't be loaded is left out."""
+    """Every bundle on every backend that this machine has, first on that which the rule chooses.
+
+    What can't be loaded is left out.
+    """
     for bundle in [*served, *([paper] if paper else [])]:
-        for backend in available():
+        for backend in dict.fromkeys((choose(bundle), *usable(bundle))):
             try:
                 engine = load_engine(bundle, backend, threads=threads)
                 engine.warm()

@@ -72,7 +72,17 @@ def tune(subject: Tunable, views: Sequence[View], seconds: float, seed: int) -> 
             best, least = candidate, found
             print(f"{gone:4.0%} {least:.5f} {asdict(best)}", flush=True)
     dssim = {"tuned": round(least, 5), "published": round(published, 5)}
+    print("at an end of its range:", ", ".join(at_ends(best, subject.ranges)) or "none", flush=True)
     return {"parameters": asdict(best), "trials": trials, "dssim": dssim}
+
+
+def at_ends(parameters: Any, ranges: Ranges) -> list[str]:
+    """Which parameters lie within 2 % of an end of their range: it may be too narrow."""
+    near = []
+    for name, (low, high) in ranges.items():
+        share = (getattr(parameters, name) - low) / (high - low)
+        near += [f"{name} {getattr(parameters, name)}"] if not 0.02 < share < 0.98 else []
+    return near
 
 
 def changed(base: Any, ranges: Ranges, names: list[str], reach: float, rng: random.Random) -> Any:
@@ -94,12 +104,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="where the result goes (JSON)")
     parser.add_argument("--seconds", type=float, default=600.0, help="search time of each method")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--views", type=int, help="at most; default: all that show something")
     options = parser.parse_args()
-    views = load_views(options.data, options.effect)
+    views = load_views(options.data, options.effect, options.views)
     result: dict[str, Any] = {"scenes": [view.scene for view in views]}
     for name in getattr(baselines.folder(options.effect), "METHODS", {}).values():
         module = import_module(f"{baselines.__name__}.{options.effect}.{name}")
         if subject := getattr(module, "TUNABLE", None):
+            print(f"{name} on {len(views)} views", flush=True)
             result[name] = tune(subject, views, options.seconds, options.seed)
     with replacing(options.out) as part:
         part.write_text(json.dumps(result, indent=1) + "\n", "utf-8")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade import exr, judging, metrics
-from deepshade.attributes import ATTRIBUTES
+from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS, SETTINGS, Effect
 from deepshade.errors import DataError
@@ -69,6 +69,15 @@ class View:
     def dssim(self, image: Float) -> float:
         """DSSIM of an answer (C', H, W), exposed as the reference is."""
         return metrics.dssim(self.exposed(image), self.exposed(self.reference))
+
+    def relative(self, image: Float) -> float:
+        """SMAPE of an answer of light (C', H, W), exposed as the reference is, unclipped."""
+        return judging.relative(self.reference, image)
+
+    def light(self) -> Float | None:
+        """(3, H, W) light that the effect starts from, None where it has none."""
+        names = [name for name in self.effect.inputs if ATTRIBUTES[name].unit is RADIANCE]
+        return self.attributes[names[0]] if names else None
 
     def contrast(self) -> float:
         """What the effect's row compares with `min_contrast`."""
@@ -154,7 +163,10 @@ def body(view: View, height: int = HEIGHT, width: int = WIDTH, *, grain: bool = 
     noise = np.random.default_rng(0).integers(0, 4, 2**20 + 7, dtype=np.uint16)
     channels: dict[str, NDArray[np.float16]] = {}
     for name in view.effect.inputs:
-        planes = np.clip(view.attributes[name], -_MAX_HALF, _MAX_HALF).astype(np.float16)
+        exact = view.attributes[name]
+        clipped = np.clip(exact, -_MAX_HALF, _MAX_HALF)
+        # what is infinitely far stays so: it is background
+        planes = np.where(np.isinf(exact), exact, clipped).astype(np.float16)
         for channel, plane in zip(ATTRIBUTES[name].channels, planes, strict=True):
             channels[channel] = half = _fit(plane, height, width)
             if grain:

@@ -16,8 +16,8 @@ from deepshade_report.view import Float, View
 from .walls import degenerate, groove, rubble
 
 try:
-    from deepshade_report.baselines.gi import bitmask
-    from deepshade_report.baselines.gi.bitmask import Bitmask, Parameters
+    from deepshade_report.baselines.gi import bitmask as module
+    from deepshade_report.baselines.gi.bitmask import Parameters, bitmask
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
     pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
 
@@ -43,7 +43,7 @@ def test_a_wall_of_a_groove_sees_the_other_by_its_form_factor(slope: float) -> N
     # beside the crease the other wall fills all but (1 - cos φ) / 2 of the sky, φ the groove's
     # opening: (1 + cos φ) / 2 of its light arrives
     expected = (1 + math.cos(math.radians(180 - 2 * slope))) / 2
-    image = shaded(Bitmask(16, 64, PLAIN), lit(groove(slope, slope)))[:, 126:130]
+    image = shaded(bitmask(16, 64, PLAIN), lit(groove(slope, slope)))[:, 126:130]
     found = [float(image[..., c].mean()) for c in (slice(122, 126), slice(130, 134))]
     assert found == pytest.approx([expected] * 2, abs=0.03)
 
@@ -53,7 +53,7 @@ def test_two_perpendicular_strips_exchange_their_form_factor() -> None:
     # as far as the radius R reaches: ∫ over hits within R of cosθ / π, here by quadrature
     view = groove(45, 45)
     view = replace(view, radius=view.radius * 0.4)  # all within it is in the picture
-    image = shaded(Bitmask(24, 64, PLAIN), lit(view))
+    image = shaded(bitmask(24, 64, PLAIN), lit(view))
     for pixels in (16, 40):
         x = 2 / 256 * math.tan(math.radians(4)) * pixels / math.cos(math.radians(45)) / view.radius
         n = 400
@@ -68,7 +68,7 @@ def test_two_perpendicular_strips_exchange_their_form_factor() -> None:
 def test_light_passes_linearly_and_none_comes_from_nothing() -> None:
     view, rng = rubble(), np.random.default_rng(5)
     a, b = rng.random((2, 3, 64, 64)).astype(np.float32)
-    method = Bitmask(2, 6, replace(PLAIN, blur=2, lod=-1.0))
+    method = bitmask(2, 6, replace(PLAIN, blur=2, lod=-1.0))
     first, second, both = (shaded(method, lit(view, x)) for x in (a, b, 3 * a + 1e3 * b))
     assert first.mean() > 0.05
     assert both == pytest.approx(3 * first + 1e3 * second, rel=1e-4, abs=1e-3)
@@ -77,7 +77,7 @@ def test_light_passes_linearly_and_none_comes_from_nothing() -> None:
 
 
 def test_colours_do_not_mix() -> None:
-    image = shaded(Bitmask(2, 6), lit(rubble(), np.array([1.0, 0, 0]).reshape(3, 1, 1)))
+    image = shaded(bitmask(2, 6), lit(rubble(), np.array([1.0, 0, 0]).reshape(3, 1, 1)))
     assert image[0].any()
     assert not image[1:].any()
 
@@ -85,13 +85,13 @@ def test_colours_do_not_mix() -> None:
 def test_nothing_beyond_the_radius_counts() -> None:
     view = groove(45, 45, size=64)
     near = replace(view, radius=view.radius * 0.1)
-    image = shaded(Bitmask(4, 16, PLAIN), lit(near))
+    image = shaded(bitmask(4, 16, PLAIN), lit(near))
     assert image[:, :, :24].max() < 0.04  # a sector, where samples snap to pixels
     assert image[:, 24:40, 30:34].min() > 0.2
 
 
 def test_the_scene_s_scale_changes_nothing() -> None:
-    one, other = (shaded(Bitmask(2, 4), lit(view)) for view in (rubble(), rubble(scale=1e4)))
+    one, other = (shaded(bitmask(2, 4), lit(view)) for view in (rubble(), rubble(scale=1e4)))
     assert one.std() > 0.005
     assert np.mean(np.abs(one - other) > 1e-3) < 0.01  # a sample may round to its neighbour
 
@@ -99,13 +99,13 @@ def test_the_scene_s_scale_changes_nothing() -> None:
 @pytest.mark.parametrize("name", degenerate())
 def test_no_input_yields_nonsense(name: str) -> None:
     view = degenerate()[name]
-    image = shaded(Bitmask(2, 3), lit(view))
+    image = shaded(bitmask(2, 3), lit(view))
     assert image.shape == (3, *view.background.shape)
     assert image.dtype == np.float32
     assert (np.isfinite(image) & (image >= 0)).all()
 
 
 def test_the_settings_go_from_cheap_to_best_and_quick_is_fewer() -> None:
-    samples = [math.prod(method.settings.values()) for method in bitmask.methods(False)]
+    samples = [math.prod(method.settings.values()) for method in module.methods(False)]
     assert samples == sorted(set(samples))
-    assert len(bitmask.methods(True)) < len(samples)
+    assert len(module.methods(True)) < len(samples)

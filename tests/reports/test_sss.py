@@ -18,16 +18,14 @@ from .walls import cast, degenerate, rubble
 
 try:
     from deepshade_report.baselines.sss import burley, separable
-    from deepshade_report.baselines.sss.burley import Burley
-    from deepshade_report.baselines.sss.separable import Separable
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
     pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
 
 SIZE, FOV = 64, 30.0
 PIXEL = 2 * math.tan(math.radians(FOV / 2)) / SIZE  # of a plane 1 away
 WIDE = separable.Parameters(reach=24.0, spread=2.5)
-BEST = [Burley(200, burley.Parameters()), Separable(81, WIDE)]
-BOTH = [Burley(16), Separable(7)]
+BEST = [burley.burley(200, burley.Parameters()), separable.separable(81, WIDE)]
+BOTH = [burley.burley(16), separable.separable(7)]
 
 
 def scattering(view: View, light: Any, free: Any) -> View:

@@ -29,7 +29,7 @@ from deepshade_trainer.export import (
     parity,
     write_onnx,
 )
-from deepshade_trainer.graph import bytes_per_pixel, float32_boundary
+from deepshade_trainer.graph import bytes_per_pixel, float32_marks
 from deepshade_trainer.networks import from_bundle
 from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run
@@ -135,7 +135,8 @@ def test_a_shipped_network_exports_as_it_was(tmp_path: Path) -> None:
     bundle = Bundle.load(bundle_root() / "ao" / "fast")
     shader = from_bundle(bundle.path)
     graph = write_onnx(shader, tmp_path / "model.onnx")
-    assert len(float32_boundary(graph)) == len(bundle.float32)
+    float32, after = float32_marks(graph, shader.network.rounded)
+    assert (len(float32), after) == (len(bundle.float32), [])
     assert abs(bytes_per_pixel(graph, INPUT, (6, 256, 256)) - bundle.bytes_per_pixel) <= 1
     names = {tensor.name for tensor in graph.graph.initializer}
     assert names >= shader.network.state_dict().keys()

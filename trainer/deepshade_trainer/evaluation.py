@@ -114,7 +114,7 @@ def evaluate(
         ours, truth, nothing = judging.exposed(effect, reference, image, reference, blank)
         figures = compare(ours, truth, nothing)
         if effect.is_light:
-            figures["smape"] = metrics.smape(image, reference)
+            figures["smape"] = judging.relative(reference, image)
         guide = (
             pictures.normals(sample["normal"])
             if "normal" in sample

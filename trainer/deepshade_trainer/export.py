@@ -23,7 +23,7 @@ from deepshade.errors import DataError
 from deepshade.files import replacing
 from deepshade.tensors import up
 from deepshade_trainer.dataset import Dataset, spread
-from deepshade_trainer.graph import bytes_per_pixel, float32_boundary, fold_constants, int8_ranges
+from deepshade_trainer.graph import bytes_per_pixel, float32_marks, fold_constants, int8_ranges
 from deepshade_trainer.networks import Shader, build
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
@@ -76,6 +76,8 @@ def export(
     if not worst <= TOLERANCE:
         raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
     side = up(_SIDE, shader.size_multiple)
+    rounded = shader.network.rounded
+    float32, after = float32_marks(graph, rounded)
     config = {
         "effect": recipe.effect,
         "name": folder.name,
@@ -94,8 +96,9 @@ def export(
         },
         "bytes_per_pixel": bytes_per_pixel(graph, INPUT, (shader.channels, side, side)),
         "per_channel": shader.per_channel,
-        "float32": float32_boundary(graph),
-        "int8": int8_ranges(graph, INPUT, [each.numpy() for each in trained]),
+        "float32": float32,
+        "float32_after": after,
+        "int8": int8_ranges(graph, INPUT, [each.numpy() for each in trained], rounded),
         "network": asdict(recipe.network),
         "input_name": INPUT,
         "output_name": OUTPUT,

@@ -44,12 +44,13 @@ def fold_constants(path: Path, target: Path) -> Any:
     return model
 
 
-def float32_boundary(model: Any) -> list[str]:
-    """Names of the tensors at which the arithmetic before all convolutions ends.
+def float32_marks(model: Any, rounded: str = "") -> tuple[list[str], list[str]]:
+    """Names of the tensors at which float32 arithmetic ends, and from which on it begins again.
 
-    It is arithmetic on lengths, which 16 bits would round (`Bundle.float32`). What follows a
-    convolution may be calculated in 16 bits; shapes, which are integers, stay with their users,
-    and so do channels taken out of the picture, which is no arithmetic.
+    Convolutions may be calculated in 16 bits where their weights' names begin with `rounded`. What
+    comes before is arithmetic on lengths and light, which 16 bits would round (`Bundle.float32`);
+    but shapes stay with their users, and so do channels taken out of the picture, which is no
+    arithmetic. If any may, what follows them may be rounded too, and there are no second marks.
     """
     import onnx
 
@@ -62,13 +63,26 @@ def float32_boundary(model: Any) -> list[str]:
     makers = {name: node for node in graph.node for name in node.output}
     constant = {tensor.name for tensor in graph.initializer}
     pictures = {value.name for value in graph.input}
-    later: set[str] = set()
+    later: set[str] = set()  # what depends on such a convolution
     for node in graph.node:  # ONNX keeps them in order
         sources = list(_sources(node))
-        if node.op_type in CONVOLUTIONS or later.intersection(sources):
+        if _convolves(node, rounded) or later.intersection(sources):
             later.update(node.output)
-        elif constant.issuperset(sources):
+        elif node.op_type == "Shape" or constant.issuperset(sources):
             constant.update(node.output)
+    inside: set[str] = set()  # what such a convolution depends on, and made by one
+    for node in reversed(graph.node):
+        if _convolves(node, rounded) or inside.intersection(node.output):
+            inside.update(node.output)
+            inside.update(_sources(node))
+    inside &= later
+    again = [
+        name
+        for node in graph.node
+        if rounded and not inside.intersection(node.output)
+        for name in _sources(node)
+        if name in inside
+    ]
     todo = [
         name for node in graph.node if later.intersection(node.output) for name in _sources(node)
     ]
@@ -86,7 +100,7 @@ def float32_boundary(model: Any) -> list[str]:
             boundary[name] = None
         else:
             todo += _sources(maker)
-    return list(boundary)
+    return list(boundary), list(dict.fromkeys(again))
 
 
 def bytes_per_pixel(model: Any, name: str, shape: tuple[int, int, int]) -> int:
@@ -122,18 +136,23 @@ def bytes_per_pixel(model: Any, name: str, shape: tuple[int, int, int]) -> int:
 
 
 def int8_ranges(
-    model: Any, name: str, pictures: Sequence[NDArray[np.float32]]
+    model: Any, name: str, pictures: Sequence[NDArray[np.float32]], rounded: str = ""
 ) -> dict[str, tuple[float, float]]:
     """The ranges of what convolutions that may run in 8 bits convolve, by their weights' names.
 
-    `pictures` (N, C, H, W) go through the input `name`. Those before the first convolutions stay
-    in float, and so do the last two on the way to the picture: 8 bits there would show, as bands
-    and as noise on even surfaces (without the last but one 2.2 % more DSSIM became 0.7 %).
+    `pictures` (N, C, H, W) go through the input `name`. Of the convolutions whose weights' names
+    begin with `rounded`, the first stay in float, and so do the last two on the way to the picture:
+    8 bits there would show, as bands and as noise on even surfaces (without the last but one 2.2 %
+    more DSSIM became 0.7 %).
     """
     import onnx
     import onnxruntime as ort
 
-    inner = [node for node in model.graph.node if node.op_type == "Conv" and _is_inner(node, model)]
+    inner = [
+        node
+        for node in model.graph.node
+        if node.op_type == "Conv" and _is_inner(node, model, rounded)
+    ]
     watched = onnx.ModelProto()
     watched.CopyFrom(model)
     del watched.graph.output[:]
@@ -150,11 +169,16 @@ def int8_ranges(
     return {node.input[1]: (low[node.input[0]], high[node.input[0]]) for node in inner}
 
 
-def _is_inner(node: Any, model: Any) -> bool:
-    """Whether a convolution has one or more before it and at least `MIN_AFTER` after it."""
+def _convolves(node: Any, rounded: str) -> bool:
+    """Whether it is a convolution whose weights' names begin with `rounded`."""
+    return node.op_type in CONVOLUTIONS and node.input[1].startswith(rounded)
+
+
+def _is_inner(node: Any, model: Any, rounded: str) -> bool:
+    """Whether such a convolution has one or more before it and at least `MIN_AFTER` after it."""
     before: set[str] = set()
     for other in model.graph.node:  # ONNX keeps them in order
-        if other.op_type in CONVOLUTIONS or before.intersection(other.input):
+        if _convolves(other, rounded) or before.intersection(other.input):
             before.update(other.output)
     after = {output.name: 0 for output in model.graph.output}  # by tensor: how many at least
     for other in reversed(model.graph.node):
@@ -162,8 +186,8 @@ def _is_inner(node: Any, model: Any) -> bool:
         if follow is None:
             continue
         if other is node:
-            return follow >= MIN_AFTER and node.input[0] in before
-        count = follow + (other.op_type == "Conv")
+            return _convolves(node, rounded) and follow >= MIN_AFTER and node.input[0] in before
+        count = follow + (other.op_type == "Conv" and _convolves(other, rounded))
         for each in other.input:
             after[each] = min(after.get(each, count), count)
     return False

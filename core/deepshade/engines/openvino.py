@@ -6,7 +6,8 @@ Three things here are measured rather than obvious:
   difference between two large positions (DSSIM + 35 % with bf16 on real views). So the graph is
   split where the bundle says: what comes before runs as a graph of its own in float32, the rest
   in 16 bits, and the tensors between them are handed over without a copy. After the last
-  convolution the plugin returns to float32 by itself.
+  convolution the plugin returns to float32 by itself, but not where it resizes or convolves again:
+  where light is blended, the bundle names the tensors from which on a third graph is in float32.
 - A graph of fixed size runs up to 1.5 times as fast as one with free height and width, because
   elementwise steps are only fused then, and rounds differently. So every size is compiled when it
   first comes, which takes a few tenths of a second, and kept.
@@ -19,6 +20,7 @@ import random
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -27,7 +29,7 @@ import numpy as np
 from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine, Float
 from deepshade.engines.quantising import quantise
-from deepshade.engines.splitting import split
+from deepshade.engines.splitting import Piece, split
 from deepshade.errors import EngineError
 from deepshade.machine import cpu_kind
 
@@ -107,21 +109,20 @@ class OpenVino(Engine):
         model = self._model.clone()
         try:
             model.reshape(list(shape))
-            pieces = split(model, () if self._type == "f32" else self.bundle.float32)
+            marks = self.bundle.float32, self.bundle.float32_after
+            pieces = split(model, *(marks if self._type != "f32" else ()))
             settings = {
                 "INFERENCE_NUM_THREADS": self.threads,
                 "NUM_STREAMS": 1,
                 "ENABLE_CPU_PINNING": False,  # several graphs would be pinned to the same cores
                 "CPU_RUNTIME_CACHE_CAPACITY": "0",
             }
-            types = ["f32" if piece.exact else self._type for piece in pieces]
-            graphs = [
-                _core().compile_model(
-                    piece.model, "CPU", {**settings, "INFERENCE_PRECISION_HINT": kind}
-                )
-                for piece, kind in zip(pieces, types, strict=True)
-            ]
-            return _Network(graphs, [piece.channels for piece in pieces])
+            compiled = []
+            for piece in pieces:
+                hint = {"INFERENCE_PRECISION_HINT": "f32" if piece.exact else self._type}
+                graph = _core().compile_model(piece.model, "CPU", settings | hint)
+                compiled.append(replace(piece, model=graph))
+            return _Network(compiled)
         except RuntimeError as error:
             raise EngineError(
                 f"OpenVINO can't compile {self.bundle.effect}/{self.bundle.name} "
@@ -140,17 +141,12 @@ class OpenVino(Engine):
 
 
 class _Network:
-    """One compiled graph, or two that follow each other, and requests to run them with.
+    """Compiled graphs that follow each other (see `split`), and requests to run them with."""
 
-    Of each graph the first inputs are these `channels` of the picture (see `split`), and the
-    others what the graph before it puts out.
-    """
-
-    def __init__(self, graphs: list[Any], channels: list[tuple[slice, ...]]) -> None:
+    def __init__(self, pieces: list[Piece]) -> None:
         self.held = 0  # the largest prediction, in pixels, whose memory is still taken
-        self._graphs = graphs
-        self._channels = channels
-        self._outputs = int(graphs[-1].output(0).get_partial_shape()[1].get_length())
+        self._pieces = pieces
+        self._outputs = int(pieces[-1].model.output(0).get_partial_shape()[1].get_length())
         self._idle: list[list[Any]] = []
         self._lock = threading.Lock()
 
@@ -159,20 +155,20 @@ class _Network:
         from openvino import Tensor
 
         with self._requests() as requests:
-            handed: list[Any] = []
+            handed: dict[str, Any] = {}
             count, _, height, width = gbuffer.shape
             shade = np.empty((count, self._outputs, height, width), np.float32)
             requests[-1].set_output_tensor(0, Tensor(shade, shared_memory=True))
-            for graph, channels, request in zip(
-                self._graphs, self._channels, requests, strict=True
-            ):
+            for piece, request in zip(self._pieces, requests, strict=True):
                 # Views, for one picture. They must outlive the prediction.
-                views = [np.ascontiguousarray(gbuffer[:, each]) for each in channels]
+                views = [np.ascontiguousarray(gbuffer[:, each]) for each in piece.channels]
                 given = [Tensor(view, shared_memory=True) for view in views]
-                for index, tensor in enumerate([*given, *handed]):
+                given += [handed[name] for name in piece.taken]
+                for index, tensor in enumerate(given):
                     request.set_input_tensor(index, tensor)
                 request.infer(share_outputs=True)  # else every tensor is copied for Python
-                handed = [request.get_output_tensor(k) for k in range(len(graph.outputs))]
+                for index, name in enumerate(piece.gives):
+                    handed[name] = request.get_output_tensor(index)
             self.held = max(self.held, gbuffer.size // gbuffer.shape[1])
             return shade
 
@@ -183,16 +179,16 @@ class _Network:
         with self._lock:
             self._idle.clear()
         self.held = 0
-        for graph in self._graphs:
+        for piece in self._pieces:
             with suppress(RuntimeError):  # busy; it will be asked again
-                graph.release_memory()
+                piece.model.release_memory()
 
     @contextmanager
     def _requests(self) -> Iterator[list[Any]]:
         with self._lock:
             requests = self._idle.pop() if self._idle else None
         if requests is None:
-            requests = [graph.create_infer_request() for graph in self._graphs]
+            requests = [piece.model.create_infer_request() for piece in self._pieces]
         yield requests
         with self._lock:
             self._idle.append(requests)

@@ -1,8 +1,8 @@
-"""An OpenVINO graph in two: what must be calculated in float32, and the rest."""
+"""An OpenVINO graph in pieces: what must be calculated in float32, and the rest."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,17 +11,21 @@ from deepshade.errors import EngineError
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A graph. Its first inputs are these channels of the picture, and its others what the piece
-    before it puts out, in order. An `exact` one is to be calculated in float32.
+    """A graph. Its first inputs are these `channels` of the picture, and its others the tensors
+    `taken` from pieces before it; it `gives` its outputs by these names, the last piece the answer.
+    An `exact` one is to be calculated in float32.
     """
 
     model: Any
     channels: tuple[slice, ...]
+    taken: tuple[str, ...] = ()
+    gives: tuple[str, ...] = ()
     exact: bool = False
 
 
-def split(model: Any, float32: Collection[str] = ()) -> list[Piece]:
-    """The graph's pieces: up to the tensors named in `float32`, and from there. One without names.
+def split(model: Any, float32: Sequence[str] = (), after: Sequence[str] = ()) -> list[Piece]:
+    """The graph's pieces: up to the tensors named in `float32`, from there to those in `after`,
+    and the rest. One without names.
 
     Where a graph begins by taking some channels of the picture, those become inputs of its own:
     they lie one after the other in memory, and to take them inside is to copy them. `model`,
@@ -29,22 +33,24 @@ def split(model: Any, float32: Collection[str] = ()) -> list[Piece]:
     """
     from openvino import opset13
 
-    model = model.clone()
-    if not float32:
-        return [_piece([node.input_value(0) for node in model.get_results()], _views(model))]
-    first = model.clone()
-    outputs = _tensors(first, float32)
-    given = []
-    for tensor in _tensors(model, float32):
-        entry = opset13.parameter(tensor.get_partial_shape(), tensor.get_element_type())
-        for reader in tensor.get_target_inputs():
-            reader.replace_source_output(entry.output(0))
-        given.append(entry)
-    results = [node.input_value(0) for node in model.get_results()]
-    return [_piece(outputs, _views(first), exact=True), _piece(results, _views(model), given)]
+    pieces: list[Piece] = []
+    known: list[str] = []
+    marks = [(names, exact) for names, exact in ((float32, True), (after, False)) if names]
+    for names, exact in [*marks, ((), bool(after))]:
+        part = model.clone()
+        outputs = _tensors(part, names) or [node.input_value(0) for node in part.get_results()]
+        entries = {}
+        for name, tensor in zip(known, _tensors(part, known), strict=True):
+            entry = opset13.parameter(tensor.get_partial_shape(), tensor.get_element_type())
+            for reader in tensor.get_target_inputs():
+                reader.replace_source_output(entry.output(0))
+            entries[name] = entry
+        pieces.append(_piece(outputs, _views(part), entries, tuple(names), exact))
+        known += names
+    return pieces
 
 
-def _tensors(model: Any, names: Collection[str]) -> list[Any]:
+def _tensors(model: Any, names: Sequence[str]) -> list[Any]:
     """The outputs of nodes that go by these names, in their order."""
     known = {
         name: output
@@ -85,11 +91,11 @@ def _views(model: Any) -> dict[str, tuple[Any, slice]]:
 def _piece(
     outputs: list[Any],
     views: dict[str, tuple[Any, slice]],
-    entries: Iterable[Any] = (),
-    *,
-    exact: bool = False,
+    entries: dict[str, Any],
+    gives: tuple[str, ...],
+    exact: bool,
 ) -> Piece:
-    """What gives `outputs`, with those of the `views` that it needs and then `entries`."""
+    """What gives `outputs`, with those of the `views` and then of the `entries` that it needs."""
     from openvino import Model
 
     met: set[str] = set()
@@ -100,8 +106,9 @@ def _piece(
             met.add(_name(node))
             todo += _sources(node)
     used = [view for name, view in views.items() if name in met]
-    model = Model(outputs, [node for node, _ in used] + list(entries), "piece")
-    return Piece(model, tuple(channels for _, channels in used), exact)
+    taken = {name: node for name, node in entries.items() if _name(node) in met}
+    model = Model(outputs, [node for node, _ in used] + list(taken.values()), "piece")
+    return Piece(model, tuple(channels for _, channels in used), tuple(taken), gives, exact)
 
 
 def _sources(node: Any) -> list[Any]:

@@ -24,8 +24,13 @@ def folder(effect: str) -> ModuleType | None:
     return import_module(name) if find_spec(name) else None
 
 
-def baselines(effect: str, quick: bool) -> tuple[list[Method], dict[str, str]]:
-    """All baselines of an effect, and the names of those that are missing, with the reason."""
+def baselines(
+    effect: str, quick: bool, threads: int | None = None
+) -> tuple[list[Method], dict[str, str]]:
+    """All baselines of an effect, and the names of those that are missing, with the reason.
+
+    Compiled kernels run in `threads` threads, as many as networks are given; None: all there are.
+    """
     found: list[Method] = []
     missing: dict[str, str] = {}
     for name, module in getattr(folder(effect), "METHODS", {}).items():
@@ -37,4 +42,8 @@ def baselines(effect: str, quick: bool) -> tuple[list[Method], dict[str, str]]:
             missing[name] = f"no module '{error.name}'{fix}"
         except DeepshadeError as error:
             missing[name] = f"{error} {error.fix}".strip()
+    if threads and any(method.family == "screen-space" for method in found):
+        import drjit
+
+        drjit.set_thread_count(threads)
     return found, missing

@@ -1,11 +1,7 @@
-"""What screen-space baselines share: a view on the device, samples along slices, and a filter.
+"""What rivals that see surfaces share: a view on the device, samples along slices, and a filter.
 
-Dr.Jit compiles each method into one vectorised function that keeps a pixel's whole march in
-registers: the nearest that a processor comes to the shaders that these methods were made as. (As
-separate tensor operations they took 8 to 12 times as long, and a comparison at the same
-milliseconds flattered the networks.) On a machine with a GPU the kernels run there. Positions
-follow from depths, one gather a sample, as in XeGTAO. Parameters are arguments of the compiled
-function, so that every setting shares it. All lengths are in units of the effect radius.
+Positions follow from depths, one gather a sample, as in XeGTAO. Parameters are arguments of the
+compiled function, so that every setting shares it. All lengths are in units of the effect radius.
 """
 
 from __future__ import annotations
@@ -18,10 +14,8 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from deepshade_report.baselines.picture import Grid, mi
 from deepshade_report.view import Float, View
-from deepshade_workers.backend import mitsuba
-
-mi = mitsuba()
 
 NEAREST = 1.3  # pixels between a pixel and its first sample, so that it never meets itself
 GOLDEN = 0.61803398875
@@ -29,17 +23,14 @@ TINY = 1e-12
 
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
-class Screen:
+class Screen(Grid):
     """A view on the device; depths are in units of the effect radius, 0 where there is nothing.
 
-    All but `shape` are Dr.Jit values. `depth`, `normal` (unit), `turn` and `offset` (jitter) are
+    `depth`, `normal` (unit), `turn` and `offset` (jitter) are
     flat, in row-major order; `scale` is pixels per unit at distance 1, `axis` where the optical
     axis meets the picture.
     """
 
-    shape: tuple[int, int]
-    width: Any
-    height: Any
     depth: Any
     normal: Any
     turn: Any
@@ -47,27 +38,11 @@ class Screen:
     scale: Any
     axis: Any
 
-    def pixels(self) -> tuple[Any, Any]:
-        """Column and row of every pixel."""
-        index = dr.arange(mi.Int32, dr.width(self.depth))
-        row = index // self.width
-        return index - row * self.width, row
-
     def position(self, column: Any, row: Any, depth: Any) -> Any:
         """Camera-space position, in radii, of a pixel's centre at a depth."""
         x = (mi.Float(column) + 0.5 - self.axis.x) * depth / self.scale
         y = (self.axis.y - 0.5 - mi.Float(row)) * depth / self.scale
         return mi.Vector3f(x, y, -depth)
-
-    def place(self, column: Any, row: Any) -> tuple[Any, Any]:
-        """Index of a pixel in a plane, and whether it lies in the picture."""
-        inside = (column >= 0) & (row >= 0) & (column < self.width) & (row < self.height)
-        return mi.UInt32(row * self.width + column), inside
-
-    def look(self, plane: Any, column: Any, row: Any) -> tuple[Any, Any]:
-        """Any pixel's value of a plane (or of three), and whether it lies in the picture."""
-        place, inside = self.place(column, row)
-        return dr.gather(type(plane), plane, place, inside), inside
 
 
 def open_screen(view: View) -> Screen:
@@ -88,15 +63,13 @@ def open_screen(view: View) -> Screen:
     camera = view.camera
     x, y = camera.width / 2 - camera.x0, camera.height / 2 - camera.y0
     screen = Screen(
-        (height, width),
-        dr.opaque(mi.Int32, width),
-        dr.opaque(mi.Int32, height),
-        mi.Float(np.where(there, depth, np.float32(0)).ravel()),
-        _unit(mi.Vector3f(*(mi.Float(plane) for plane in planes))),
-        mi.Float(turn),
-        mi.Float(offset),
-        dr.opaque(mi.Float, camera.pixels_per_unit),
-        mi.Point2f(dr.opaque(mi.Float, x), dr.opaque(mi.Float, y)),
+        **vars(Grid.of(height, width)),
+        depth=mi.Float(np.where(there, depth, np.float32(0)).ravel()),
+        normal=_unit(mi.Vector3f(*(mi.Float(plane) for plane in planes))),
+        turn=mi.Float(turn),
+        offset=mi.Float(offset),
+        scale=dr.opaque(mi.Float, camera.pixels_per_unit),
+        axis=mi.Point2f(dr.opaque(mi.Float, x), dr.opaque(mi.Float, y)),
     )
     dr.eval(screen.normal)
     return screen

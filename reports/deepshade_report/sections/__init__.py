@@ -29,6 +29,8 @@ class Point:
     settings: dict[str, Any]
     quartiles: tuple[float, float] = (0.0, 0.0)  # of the milliseconds
     of_trivial: float = 0.0  # the error as a share of the trivial answer's
+    standard_error: float | None = None  # of the error, over views
+    relative: float | None = None  # of light: SMAPE, unclipped
 
     @property
     def milliseconds(self) -> float:
@@ -64,6 +66,8 @@ def points(sections: Sections) -> list[Point]:
             row["settings"],
             tuple(row["ms"]["quartiles"]),
             errors[row["id"]]["of_trivial"],
+            errors[row["id"]].get("standard_error"),
+            errors[row["id"]].get("relative"),
         )
         for row in rows(sections, "speed")
         if row["id"] in errors

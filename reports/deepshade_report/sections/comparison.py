@@ -54,7 +54,7 @@ def comparison(context: Context) -> dict[str, Any]:
 
 
 def draw(view: View, panels: list[dict[str, Any]], images: list[Float]) -> bytes:
-    """PNG: each panel's image (C, H, W) over its difference, and the reference over normals."""
+    """PNG: each panel's image (C, H, W) over its difference, reference over normals or light."""
     from matplotlib.figure import Figure
 
     reference = view.exposed(view.reference)
@@ -67,6 +67,8 @@ def draw(view: View, panels: list[dict[str, Any]], images: list[Float]) -> bytes
     below = np.full((*reference.shape[1:], 3), 255, np.uint8)
     if "normal" in view.attributes:
         below = pictures.normals(view.attributes["normal"])
+    elif (light := view.light()) is not None:
+        below = pictures.of_effect(view.exposed(light), view.effect)
     columns.append((pictures.of_effect(reference, view.effect), below, "reference", ""))
     with themed():
         figure = Figure(figsize=(2.6 * len(columns), 5.9), layout="constrained")

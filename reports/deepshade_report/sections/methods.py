@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from functools import partial
-from statistics import fmean
+from statistics import fmean, stdev
 from typing import Any
 
 from deepshade.errors import DeepshadeError
@@ -20,7 +21,7 @@ _SPEED_SECONDS = 100.0
 def methods(context: Context) -> tuple[dict[str, Method], dict[str, str]]:
     """All that this machine can compare, by identity, and what is missing with the reason."""
     own = networks(context.served, context.paper_network, context.threads)
-    others, missing = baselines(context.effect, context.quick)
+    others, missing = baselines(context.effect, context.quick, context.threads)
     if context.paper_network is None:
         missing["the paper's network"] = "no bundle of it: name one with --paper"
     return {identity(method): method for method in (*own, *others)}, missing
@@ -30,8 +31,10 @@ def error(context: Context) -> dict[str, Any]:
     """Mean DSSIM of every method over the held-out views, beside the trivial answer's."""
     views = context.views
     found, missing = methods(context)
-    trivial = fmean(view.dssim(view.trivial()) for view in views)
+    nothing = [view.dssim(view.trivial()) for view in views]
+    trivial = fmean(nothing)
     errors: dict[str, list[float]] = {name: [] for name in found}
+    relative: dict[str, list[float]] = {name: [] for name in found}  # of light only
     for number, view in enumerate(views):  # outermost: what traces rays keeps a view's scene
         for index, (name, method) in enumerate(found.items()):
             if name in missing:
@@ -39,7 +42,10 @@ def error(context: Context) -> dict[str, Any]:
             context.advance((number + index / len(found)) / len(views), f"{view.scene}: {name}")
             try:
                 method.prepare(view)
-                errors[name].append(significant(view.dssim(shaded(method, view))))
+                image = shaded(method, view)
+                errors[name].append(significant(view.dssim(image)))
+                if view.effect.is_light:
+                    relative[name].append(view.relative(image))
             except DeepshadeError as problem:
                 missing[name] = str(problem)
     rows = []
@@ -47,12 +53,15 @@ def error(context: Context) -> dict[str, Any]:
         if name not in missing:
             mean = fmean(each)
             about = {"dssim": significant(mean), "of_trivial": significant(mean / trivial)}
-            rows.append({**facts(found[name]), **about, "each": each})
+            beside = {"standard_error": standard_error(each), "relative": mean_of(relative[name])}
+            rows.append({**facts(found[name]), **about, **beside, "each": each})
     return {
         "views": len(views),
         "scenes": sorted({view.scene for view in views}),
         "size": [views[0].width, views[0].height],
         "trivial_dssim": significant(trivial),
+        "trivial_standard_error": standard_error(nothing),
+        "trivial_relative": mean_of([v.relative(v.trivial()) for v in views if v.effect.is_light]),
         "rows": rows,
         "missing": missing,
     }
@@ -94,6 +103,16 @@ def speed(context: Context) -> dict[str, Any]:
 def shaded(method: Method, view: View) -> Any:
     """(C, H, W) of the prepared view."""
     return method.shade(view).reshape(view.reference.shape)
+
+
+def mean_of(each: Sequence[float]) -> float | None:
+    """The mean, None of nothing."""
+    return significant(fmean(each)) if each else None
+
+
+def standard_error(each: Sequence[float]) -> float | None:
+    """That of the mean over views, None of a single one."""
+    return significant(stdev(each) / math.sqrt(len(each))) if len(each) > 1 else None
 
 
 def facts(method: Method) -> dict[str, Any]:

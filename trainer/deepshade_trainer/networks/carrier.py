@@ -12,7 +12,7 @@ from deepshade.errors import ConfigError
 from deepshade_trainer.networks.bases import BASES
 from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
 from deepshade_trainer.networks.network import Network, check_types
-from deepshade_trainer.networks.receptive_field import Span, joined
+from deepshade_trainer.networks.receptive_field import Span, folded, joined
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,7 @@ class Carrier(Network):
     """
 
     linear = True
+    rounded = "trunk."
 
     def __init__(self, config: CarrierConfig) -> None:
         super().__init__()
@@ -71,13 +72,16 @@ class Carrier(Network):
     @property
     def size_multiple(self) -> int:
         """What both parts need."""
-        return math.lcm(self.trunk.size_multiple, self.bases.size_multiple)
+        return math.lcm(self.trunk.size_multiple * self.bases.cell, self.bases.size_multiple)
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        reach = self.bases.reach
-        first = self.trunk.receptive_field(pixel - reach)[0]
-        last = self.trunk.receptive_field(pixel + reach)[1]
+        reach, cell = self.bases.reach, self.bases.cell
+        cells = (
+            self.trunk.receptive_field((pixel - reach) // cell)[0],
+            self.trunk.receptive_field((pixel + reach) // cell)[1],
+        )
+        first, last = folded(cells, cell)
         wide = joined(self.bases.receptive_field(first), self.bases.receptive_field(last))
         return joined(wide, self.bases.receptive_field(pixel))
 

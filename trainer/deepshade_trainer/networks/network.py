@@ -22,6 +22,9 @@ class Network(nn.Module, ABC):
 
     # Whether light passes linearly, three colours at once: then no curve stands before or after.
     linear = False
+    # Convolutions may be calculated in 16 and 8 bits where their weights' names begin so. If only
+    # some may, all that doesn't lie between those is calculated in float32.
+    rounded = ""
 
     @property
     @abstractmethod

@@ -4,7 +4,13 @@ from deepshade_trainer.presets.paper import PAPER
 
 PRESETS = {
     "balanced": {
-        "network": {"kind": "carrier", "bases": "discs", "widths": (24, 48, 64), "up": (1, 2)}
+        "network": {
+            "kind": "carrier",
+            "bases": "discs",
+            "widths": (24, 32, 48),
+            "steps": (2, 2),
+            "up": (1, 1),
+        }
     },
     "paper": {**PAPER, "network": {"kind": "paper", "u0": 8, "levels": 5}},
 }

@@ -21,8 +21,9 @@ from typing import Any
 
 import drjit as dr
 
-from deepshade_report.baselines.ao.marching import RANGES, Marching, Parameters, sample
-from deepshade_report.baselines.screen import TINY, Screen, mi, plane, start, stride
+from deepshade_report.baselines.ao.marching import RANGES, Parameters, marching, sample
+from deepshade_report.baselines.picture import Filter, mi
+from deepshade_report.baselines.screen import TINY, Screen, plane, start, stride
 from deepshade_report.tuning import Tunable, tuned
 
 # slices and steps to each side, from cheap to best
@@ -34,17 +35,17 @@ QUICK = ((2, 4), (6, 8))
 PUBLISHED = Parameters(radius=1.457, falloff=0.615, bias=0.0, spread=2.0, blur=2)
 
 
-def gtao(slices: int, steps: int, parameters: Parameters | None = None) -> Marching:
+def gtao(slices: int, steps: int, parameters: Parameters | None = None) -> Filter:
     """GTAO as a Method, with the parameters that were tuned or those given."""
     settings = {"slices": slices, "steps": steps}
     parameters = parameters or Parameters(**tuned(__package__, "gtao"))
-    return Marching("GTAO", settings, parameters, _march)
+    return marching("GTAO", settings, parameters, _march)
 
 
 TUNABLE = Tunable(partial(gtao, 3, 6), PUBLISHED, RANGES)
 
 
-def methods(quick: bool) -> list[Marching]:
+def methods(quick: bool) -> list[Filter]:
     """GTAO at its settings, from cheap to best; in a quick report, two of them."""
     return [gtao(slices, steps) for slices, steps in (QUICK if quick else SETTINGS)]
 

@@ -18,8 +18,9 @@ from typing import Any
 
 import drjit as dr
 
-from deepshade_report.baselines.ao.marching import RANGES, Marching, Parameters, sample
-from deepshade_report.baselines.screen import Screen, mi, plane, start, stride
+from deepshade_report.baselines.ao.marching import RANGES, Parameters, marching, sample
+from deepshade_report.baselines.picture import Filter, mi
+from deepshade_report.baselines.screen import Screen, plane, start, stride
 from deepshade_report.tuning import Tunable, tuned
 
 # directions and steps a direction, from cheap to best
@@ -31,17 +32,17 @@ QUICK = ((4, 4), (8, 8))
 PUBLISHED = Parameters(radius=1.0, falloff=1.0, bias=0.1, spread=1.0)
 
 
-def hbao(directions: int, steps: int, parameters: Parameters | None = None) -> Marching:
+def hbao(directions: int, steps: int, parameters: Parameters | None = None) -> Filter:
     """HBAO as a Method, with the parameters that were tuned or those given."""
     settings = {"directions": directions, "steps": steps}
     parameters = parameters or Parameters(**tuned(__package__, "hbao"))
-    return Marching("HBAO", settings, parameters, _march)
+    return marching("HBAO", settings, parameters, _march)
 
 
 TUNABLE = Tunable(partial(hbao, 8, 4), PUBLISHED, RANGES)
 
 
-def methods(quick: bool) -> list[Marching]:
+def methods(quick: bool) -> list[Filter]:
     """HBAO at its settings, from cheap to best; in a quick report, two of them."""
     return [hbao(directions, steps) for directions, steps in (QUICK if quick else SETTINGS)]
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
-from deepshade_report.baselines.screen import TINY, Screen, mi, open_screen, smoothed
+from deepshade_report.baselines.picture import Filter, mi
+from deepshade_report.baselines.screen import TINY, Screen, open_screen, smoothed
 from deepshade_report.tuning import Ranges
-from deepshade_report.view import Float, View
 
 
 @dataclass(frozen=True)
@@ -47,40 +47,23 @@ RANGES: Ranges = {
 }
 
 
-class Marching:
-    """A screen-space Method.
+def marching(
+    name: str, settings: dict[str, int], parameters: Parameters, kernel: Callable[..., Any]
+) -> Filter:
+    """A Method whose answers are in [0, 1], 1 = open.
 
     `settings` are how many directions or slices, and how many steps in each. The `kernel` gives
     every pixel's occlusion of a Screen, these counts and all parameters but the filter's two.
     """
 
-    family = "screen-space"
+    def shade(screen: Screen, ways: int, steps: int, *given: float) -> Any:
+        *rest, blur, edge = given
+        counts = [dr.opaque(mi.UInt32, count) for count in (ways, steps)]
+        numbers = [dr.opaque(mi.Float, float(value)) for value in rest]
+        image = smoothed(screen, kernel(screen, *counts, *numbers), int(blur), edge)
+        return dr.select(screen.depth > 0, dr.clip(image, 0, 1), 1)
 
-    def __init__(
-        self,
-        name: str,
-        settings: dict[str, Any],
-        parameters: Parameters,
-        kernel: Callable[..., Any],
-    ) -> None:
-        self.name, self.settings = name, settings
-        self.parameters, self.kernel = parameters, kernel
-        self._screen: Screen | None = None
-
-    def prepare(self, view: View) -> None:
-        """Put the view on the device."""
-        self._screen = open_screen(view)
-
-    def shade(self, view: View) -> Float:
-        """(H, W) in [0, 1], 1 = open, of the prepared view."""
-        assert self._screen is not None
-        *given, blur, edge = astuple(self.parameters)
-        counts = [dr.opaque(mi.UInt32, count) for count in self.settings.values()]
-        numbers = [dr.opaque(mi.Float, float(value)) for value in given]
-        image = smoothed(self._screen, self.kernel(self._screen, *counts, *numbers), blur, edge)
-        image = dr.select(self._screen.depth > 0, dr.clip(image, 0, 1), 1)
-        result: Float = image.numpy().reshape(self._screen.shape)
-        return result
+    return Filter(name, settings, parameters, open_screen, shade)
 
 
 def sample(

@@ -17,24 +17,16 @@ that the sum over pixels is that of the unrounded angles.
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import drjit as dr
 
-from deepshade_report.baselines.gi.lit import LEVELS, Lit, open_lit, picture, pyramid
-from deepshade_report.baselines.screen import (
-    GOLDEN,
-    TINY,
-    mi,
-    plane,
-    smoothed,
-    start,
-    stride,
-)
+from deepshade_report.baselines.gi.lit import LEVELS, Lit, open_lit, pyramid
+from deepshade_report.baselines.picture import Filter, mi
+from deepshade_report.baselines.screen import GOLDEN, TINY, plane, smoothed, start, stride
 from deepshade_report.tuning import Ranges, Tunable, tuned
-from deepshade_report.view import Float, View
 
 # slices and steps to each side, from cheap to best; SSRT3 offers 1 to 4 and 1 to 32
 SETTINGS = ((1, 4), (1, 8), (2, 8), (4, 8), (4, 16), (8, 24))
@@ -81,41 +73,30 @@ RANGES: Ranges = {
 }
 
 
-class Bitmask:
-    """The visibility bitmask as a Method."""
-
-    family = "screen-space"
-    name = "visibility bitmask"
-
-    def __init__(self, slices: int, steps: int, parameters: Parameters | None = None) -> None:
-        self.settings = {"slices": slices, "steps": steps}
-        found = replace(PUBLISHED, **tuned(__package__, "bitmask"))
-        self.parameters = parameters or found
-        self._lit: Lit | None = None
-
-    def prepare(self, view: View) -> None:
-        """Put the view on the device."""
-        self._lit = open_lit(view)
-
-    def shade(self, view: View) -> Float:
-        """(3, H, W), not negative, of the prepared view; 0 in background."""
-        assert self._lit is not None
-        *given, blur, edge = astuple(self.parameters)
-        counts = [dr.opaque(mi.UInt32, count) for count in self.settings.values()]
-        numbers = [dr.opaque(mi.Float, float(value)) for value in given]
-        levels, places = pyramid(self._lit)
-        dr.eval(levels)
-        screen = self._lit.screen
-        image = _march(self._lit, levels, places, *counts, *numbers)
-        return picture(screen, smoothed(screen, image, blur, edge, bent=True))
+def bitmask(slices: int, steps: int, parameters: Parameters | None = None) -> Filter:
+    """The visibility bitmask as a Method, with the parameters that were tuned or those given."""
+    parameters = parameters or Parameters(**tuned(__package__, "bitmask"))
+    settings = {"slices": slices, "steps": steps}
+    return Filter("visibility bitmask", settings, parameters, open_lit, _shade)
 
 
-TUNABLE = Tunable(partial(Bitmask, 2, 8), PUBLISHED, RANGES)
+TUNABLE = Tunable(partial(bitmask, 2, 8), PUBLISHED, RANGES)
 
 
-def methods(quick: bool) -> list[Bitmask]:
+def methods(quick: bool) -> list[Filter]:
     """The method at its settings, from cheap to best; in a quick report, two of them."""
-    return [Bitmask(slices, steps) for slices, steps in (QUICK if quick else SETTINGS)]
+    return [bitmask(slices, steps) for slices, steps in (QUICK if quick else SETTINGS)]
+
+
+def _shade(lit: Lit, slices: int, steps: int, *given: float) -> Any:
+    *rest, blur, edge = given
+    counts = [dr.opaque(mi.UInt32, count) for count in (slices, steps)]
+    numbers = [dr.opaque(mi.Float, float(value)) for value in rest]
+    levels, places = pyramid(lit)
+    dr.eval(levels)
+    image = _march(lit, levels, places, *counts, *numbers)
+    image = smoothed(lit.screen, image, int(blur), edge, bent=True)
+    return dr.select(lit.screen.depth > 0, image, 0)
 
 
 @dr.syntax

@@ -8,8 +8,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from deepshade_report.baselines.screen import Screen, mi, open_screen
-from deepshade_report.view import Float, View
+from deepshade_report.baselines.picture import mi
+from deepshade_report.baselines.screen import Screen, open_screen
+from deepshade_report.view import View
 
 LEVELS = 5  # of the light, each half as large as the one before
 
@@ -63,10 +64,3 @@ def pyramid(lit: Lit) -> tuple[Any, Any]:
         rows.append(half)
         begin, width, height = begin + half * low, half, low
     return dr.concat(parts), mi.UInt32([*starts, *rows])
-
-
-def picture(screen: Screen, image: Any) -> Float:
-    """(3, H, W) of three planes; 0 where there is nothing."""
-    image = dr.select(screen.depth > 0, image, 0)
-    result: Float = image.numpy().reshape(3, *screen.shape)
-    return result

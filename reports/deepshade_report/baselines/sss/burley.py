@@ -12,17 +12,18 @@ profile at its true distance in space over that at its radius, and the sum is no
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from deepshade_report.baselines.screen import TINY, mi, smoothed
-from deepshade_report.baselines.sss.surface import Surface, open_surface, picture
+from deepshade_report.baselines.picture import Filter, mi
+from deepshade_report.baselines.screen import TINY, smoothed
+from deepshade_report.baselines.sss.surface import Surface, open_surface
 from deepshade_report.tuning import Ranges, Tunable, tuned
-from deepshade_report.view import Float, View
+from deepshade_report.view import View
 
 SETTINGS = (8, 16, 32, 64, 128, 200)  # taps; O3DE has 200
 QUICK = (16, 64)
@@ -53,45 +54,40 @@ RANGES: Ranges = {
 }
 
 
-class Burley:
-    """The importance-sampled filter as a Method."""
-
-    family = "screen-space"
-    name = "Burley"
-
-    def __init__(self, taps: int, parameters: Parameters | None = None) -> None:
-        self.settings = {"taps": taps}
-        self.parameters = parameters or replace(PUBLISHED, **tuned(__package__, "burley"))
-        self._surface: Surface | None = None
-        self._packed: Any = None
-
-    def prepare(self, view: View) -> None:
-        """Put the view on the device."""
-        self._surface = surface = open_surface(view)
-        # light and depth of a pixel by one look; -1 marks a channel that doesn't scatter
-        light = dr.select(surface.free > 0, dr.maximum(surface.light, 0), -1)
-        depth = surface.screen.depth
-        self._packed = dr.ravel(mi.Vector4f(light.x, light.y, light.z, depth))
-        dr.eval(self._packed)
-
-    def shade(self, view: View) -> Float:
-        """(3, H, W), not negative, of the prepared view."""
-        assert self._surface is not None
-        taps = self.settings["taps"]
-        width, small, blur, edge = astuple(self.parameters)
-        numbers = [dr.opaque(mi.Float, float(value)) for value in (width, small)]
-        count = dr.opaque(mi.UInt32, taps)
-        image = _gather(self._surface, self._packed, _spiral(taps), count, *numbers)
-        image = smoothed(self._surface.screen, image, blur, edge)
-        return picture(self._surface, image)
+def burley(taps: int, parameters: Parameters | None = None) -> Filter:
+    """The importance-sampled filter as a Method, with the parameters tuned or those given."""
+    parameters = parameters or Parameters(**tuned(__package__, "burley"))
+    return Filter("Burley", {"taps": taps}, parameters, upload, _shade)
 
 
-TUNABLE = Tunable(partial(Burley, 64), PUBLISHED, RANGES)
+TUNABLE = Tunable(partial(burley, 64), PUBLISHED, RANGES)
 
 
-def methods(quick: bool) -> list[Burley]:
+def methods(quick: bool) -> list[Filter]:
     """The method from few taps to many; in a quick report, twice."""
-    return [Burley(taps) for taps in (QUICK if quick else SETTINGS)]
+    return [burley(taps) for taps in (QUICK if quick else SETTINGS)]
+
+
+def upload(view: View) -> tuple[Surface, Any]:
+    """The view on the device, and its light and depth by one look: four floats a pixel.
+
+    -1 marks a channel that doesn't scatter.
+    """
+    surface = open_surface(view)
+    light = dr.select(surface.free > 0, dr.maximum(surface.light, 0), -1)
+    packed = dr.ravel(mi.Vector4f(light.x, light.y, light.z, surface.screen.depth))
+    dr.eval(packed)
+    return surface, packed
+
+
+def _shade(
+    frame: tuple[Surface, Any], taps: int, width: float, small: float, blur: int, edge: float
+) -> Any:
+    surface, packed = frame
+    numbers = [dr.opaque(mi.Float, value) for value in (width, small)]
+    image = _gather(surface, packed, _spiral(taps), dr.opaque(mi.UInt32, taps), *numbers)
+    image = smoothed(surface.screen, image, blur, edge)
+    return dr.select(surface.free > 0, image, surface.light)
 
 
 def radius(share: Any) -> Any:

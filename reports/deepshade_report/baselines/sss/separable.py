@@ -10,17 +10,18 @@ tap fades to the centre's own light ("follow surface"), as it does where nothing
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from deepshade_report.baselines.screen import TINY, Screen, mi
-from deepshade_report.baselines.sss.surface import Surface, open_surface, picture
+from deepshade_report.baselines.picture import Filter, mi
+from deepshade_report.baselines.screen import TINY, Screen
+from deepshade_report.baselines.sss.surface import Surface, open_surface
 from deepshade_report.tuning import Ranges, Tunable, tuned
-from deepshade_report.view import Float, View
+from deepshade_report.view import Float
 
 SETTINGS = (7, 11, 17, 25, 41)  # taps a pass, odd; the paper's is 7, its code offers 11 to 25
 QUICK = (7, 17)
@@ -44,51 +45,35 @@ PUBLISHED = Parameters()
 RANGES: Ranges = {"reach": (2.0, 24.0), "spread": (1.0, 3.0), "edge": (0.2, 10.0)}
 
 
-class Separable:
-    """The two passes as a Method."""
-
-    family = "screen-space"
-    name = "separable"
-
-    def __init__(self, taps: int, parameters: Parameters | None = None) -> None:
-        self.settings = {"taps": taps}
-        self.parameters = parameters or replace(PUBLISHED, **tuned(__package__, "separable"))
-        self._surface: Surface | None = None
-
-    def prepare(self, view: View) -> None:
-        """Put the view on the device."""
-        self._surface = open_surface(view)
-
-    def shade(self, view: View) -> Float:
-        """(3, H, W) of the prepared view."""
-        assert self._surface is not None
-        reach, spread, edge = astuple(self.parameters)
-        side = self.settings["taps"] // 2
-        offsets, weights = kernel(side, reach, spread)
-        taps = mi.Float(offsets[1:]), mi.Float(weights[1:]), dr.opaque(mi.Float, weights[0])
-        count = dr.opaque(mi.UInt32, side)
-        fade = dr.opaque(mi.Float, edge / reach)
-        light = self._surface.light
-        for down in (0, 1):
-            planes = []
-            for free, plane in zip(self._surface.free, light, strict=True):
-                marked = dr.select(free > 0, plane, -1)  # what doesn't scatter lends nothing
-                packed = dr.ravel(mi.Vector2f(marked, self._surface.screen.depth))
-                dr.eval(packed)
-                planes.append(
-                    _pass(self._surface.screen, packed, plane, free, *taps, count, fade, down=down)
-                )
-            light = mi.Color3f(*planes)
-            dr.eval(light)
-        return picture(self._surface, light)
+def separable(taps: int, parameters: Parameters | None = None) -> Filter:
+    """The two passes as a Method, with the parameters that were tuned or those given."""
+    parameters = parameters or Parameters(**tuned(__package__, "separable"))
+    return Filter("separable", {"taps": taps}, parameters, open_surface, _shade)
 
 
-TUNABLE = Tunable(partial(Separable, 17), PUBLISHED, RANGES)
+TUNABLE = Tunable(partial(separable, 17), PUBLISHED, RANGES)
 
 
-def methods(quick: bool) -> list[Separable]:
+def methods(quick: bool) -> list[Filter]:
     """The method from few taps to many; in a quick report, twice."""
-    return [Separable(taps) for taps in (QUICK if quick else SETTINGS)]
+    return [separable(taps) for taps in (QUICK if quick else SETTINGS)]
+
+
+def _shade(surface: Surface, taps: int, reach: float, spread: float, edge: float) -> Any:
+    offsets, weights = kernel(taps // 2, reach, spread)
+    line = mi.Float(offsets[1:]), mi.Float(weights[1:]), dr.opaque(mi.UInt32, taps // 2)
+    fade = dr.opaque(mi.Float, edge / reach)
+    light = surface.light
+    for down in (0, 1):
+        planes = []
+        for free, plane in zip(surface.free, light, strict=True):
+            marked = dr.select(free > 0, plane, -1)  # what doesn't scatter lends nothing
+            packed = dr.ravel(mi.Vector2f(marked, surface.screen.depth))
+            dr.eval(packed)
+            planes.append(_pass(surface.screen, packed, plane, free, *line, fade, down=down))
+        light = mi.Color3f(*planes)
+        dr.eval(light)
+    return dr.select(surface.free > 0, light, surface.light)
 
 
 @lru_cache
@@ -127,7 +112,6 @@ def _pass(
     free: Any,
     offsets: Any,
     weights: Any,
-    centre: Any,
     count: Any,
     fade: Any,
     *,

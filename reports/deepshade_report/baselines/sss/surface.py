@@ -8,8 +8,9 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from deepshade_report.baselines.screen import Screen, mi, open_screen
-from deepshade_report.view import Float, View
+from deepshade_report.baselines.picture import mi
+from deepshade_report.baselines.screen import Screen, open_screen
+from deepshade_report.view import View
 
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
@@ -34,10 +35,3 @@ def open_surface(view: View) -> Surface:
     planes = [mi.Color3f(*(mi.Float(np.ascontiguousarray(p)) for p in x)) for x in (light, free)]
     dr.eval(planes)
     return Surface(screen, *planes)
-
-
-def picture(surface: Surface, image: Any) -> Float:
-    """(3, H, W) of three planes; the light as it was where nothing scatters."""
-    image = dr.select(surface.free > 0, image, surface.light)
-    result: Float = image.numpy().reshape(3, *surface.screen.shape)
-    return result
