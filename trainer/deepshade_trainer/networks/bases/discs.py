@@ -127,7 +127,9 @@ class Discs(Bases):
         """See `Network.receptive_field`."""
         half = doubled((pixel, pixel))
         mild, strong = (
-            max(self.get_buffer(f"disc{r:g}").shape[-1] // 2 for r in _RADII[1:] if (r > _HALF) == s)
+            max(
+                self.get_buffer(f"disc{r:g}").shape[-1] // 2 for r in _RADII[1:] if (r > _HALF) == s
+            )
             for s in (False, True)
         )
         quarter = grown(doubled(half), strong)
