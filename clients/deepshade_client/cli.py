@@ -41,6 +41,9 @@ def shade(
         typer.Option("--out", "-o", help="A file, folder, or pattern with {name} and {effect}."),
     ] = None,
     radius: Annotated[float | None, typer.Option(help="Effect radius, scene units.")] = None,
+    focus: Annotated[float | None, typer.Option(help="Distance in focus, scene units.")] = None,
+    aperture: Annotated[float | None, typer.Option(help="Lens diameter, scene units.")] = None,
+    shutter: Annotated[float | None, typer.Option(help="Open for so many frames.")] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
     map_: Annotated[
         list[str] | None,
@@ -91,6 +94,9 @@ def shade(
     png = png or (out or "").lower().endswith(".png")
     options = Options(
         radius=radius,
+        focus=focus,
+        aperture=aperture,
+        shutter=shutter,
         fov=fov,
         profile=profile,
         mapping=parse_mapping(map_ or []),

@@ -37,8 +37,9 @@ Picture = Source | Sequence[Source] | Mapping[str, Source]
 class Options:
     """What a shading request may ask for; None leaves it to the service.
 
-    `radius` is in scene units, `fov` the full horizontal angle in degrees, `mapping` says which
-    layer or comma-separated channels hold an attribute, `half` asks for 16-bit pixels.
+    `radius`, `focus` and `aperture` are in scene units, `shutter` in frames, `fov` is the full
+    horizontal angle in degrees, `mapping` says which layer or comma-separated channels hold an
+    attribute, `half` asks for 16-bit pixels.
 
     What shades: `quality` ("fast", "balanced", "best") or `bundle` by name; `max_error` (DSSIM)
     asks for the fastest within an error, `budget_ms` for the most accurate within a time of the
@@ -46,6 +47,9 @@ class Options:
     """
 
     radius: float | None = None
+    focus: float | None = None
+    aperture: float | None = None
+    shutter: float | None = None
     fov: float | None = None
     profile: str | None = None
     mapping: Mapping[str, str] | None = None

@@ -25,10 +25,14 @@ _STEP = 8  # every how many pixels the median depth is taken
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """One channel of a network's input: an (H, W) array, and what to divide it by."""
+    """One channel of a network's input: an (H, W) array, and what to divide it by.
+
+    Past the picture one that `goes_on` repeats its last pixels, any other is 0.
+    """
 
     pixels: Float
     divisor: float | None = None
+    goes_on: bool = False
 
 
 def channel_count(inputs: Iterable[str], per_channel: bool) -> int:
@@ -81,12 +85,13 @@ def planes(
         if channel is not None and attribute.coloured:
             pixels = pixels[channel : channel + 1]
         divisor = scale if attribute.unit.scaled and scale != 1 else None
-        found += [Plane(plane, divisor) for plane in pixels]
+        # Past the picture is background, whose light is no darker than what lies beside it.
+        found += [Plane(plane, divisor, attribute.in_background) for plane in pixels]
     return found
 
 
 def cut(channels: Sequence[Plane], box: Box) -> Float:
-    """(1, C, bottom - top, right - left): the box of every channel, scaled; 0 past the picture.
+    """(1, C, bottom - top, right - left): the box of every channel, scaled, past the picture too.
 
     No copy where the planes are that already.
     """
@@ -106,6 +111,9 @@ def cut(channels: Sequence[Plane], box: Box) -> Float:
             target[:rows, :columns] = source
         else:
             scale(source, plane.divisor, target[:rows, :columns])
+        if plane.goes_on:
+            target[:rows, columns:] = target[:rows, columns - 1 : columns]
+            target[rows:] = target[rows - 1]
     return tensor
 
 
@@ -118,7 +126,7 @@ def tensor(
     per_channel: bool,
     multiple: int = 1,
 ) -> Float:
-    """(N, C, h, w): a whole picture, sides padded with 0 to multiples of `multiple`.
+    """(N, C, h, w): a whole picture, sides padded to multiples of `multiple`, as `cut` does.
 
     N is 3 with `per_channel`, one run for each colour channel, else 1.
     """

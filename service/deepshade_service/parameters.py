@@ -16,6 +16,7 @@ from deepshade.gbuffer.profiles import PROFILES
 from deepshade_service.problems import Problem
 
 LENS = ("focus", "aperture")  # settings from which the blur circle is derived
+CAMERA = (*LENS, "shutter")
 
 Compression = StrEnum("Compression", {name: name for name in COMPRESSIONS})  # type: ignore[misc]
 Profile = StrEnum("Profile", {name: name for name in PROFILES})  # type: ignore[misc]
@@ -40,6 +41,9 @@ class ShadeParameters(BaseModel):
     radius: Annotated[float | None, _setting("radius", ", else the bundle's own")] = None
     focus: Annotated[float | None, _setting("focus")] = None
     aperture: Annotated[float | None, _setting("aperture")] = None
+    shutter: Annotated[
+        float | None, _setting("shutter", ", for which its motion holds; that is scaled")
+    ] = None
     fov: Annotated[
         float | None,
         Field(
@@ -122,7 +126,7 @@ class ShadeParameters(BaseModel):
 
     def check(self, effect: Effect) -> None:
         """Raises Problem 422 for a setting that the effect doesn't have."""
-        for name in ("radius", *LENS):
+        for name in ("radius", *CAMERA):
             if getattr(self, name) is not None and name not in effect.settings:
                 raise Problem(
                     422,

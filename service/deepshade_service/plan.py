@@ -13,7 +13,7 @@ from deepshade import exr
 from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.gbuffer import GBuffer
 from deepshade_service.memory import Need
-from deepshade_service.parameters import LENS, ShadeParameters
+from deepshade_service.parameters import CAMERA, ShadeParameters
 from deepshade_service.selection import Selection
 from deepshade_service.tiles import Tile
 
@@ -81,7 +81,7 @@ def facts_of(gbuffer: GBuffer, plan: ShadePlan, made: Json) -> Facts:
     `made` is the plan as JSON. What isn't known is left out.
     """
     names = ("effect", "bundle", "bundle_sha256", "engine", "precision", "dssim", "radius")
-    facts = {name: made.get(name) for name in (*names, "radius_source", *LENS)}
+    facts = {name: made.get(name) for name in (*names, "radius_source", *CAMERA)}
     return {name: fact for name, fact in facts.items() if fact is not None} | {
         "mapped": _listed(gbuffer.mapped),
         "derived": _listed(gbuffer.derived),
@@ -98,7 +98,7 @@ def _settings(gbuffer: GBuffer, effect: str, plan: ShadePlan) -> Json:
     found: Json = {}
     if "radius" in known:
         found |= {"radius": plan.radius, "radius_source": plan.radius_source}
-    for name in LENS:
+    for name in CAMERA:
         if name in known and (value := gbuffer.header.get(SETTINGS[name].header)) is not None:
             found[name] = value if isinstance(value, float) else str(value)
     return found

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from deepshade import exr, pictures, tensors
 from deepshade.bundles import Bundle
-from deepshade.effects import EFFECTS, SETTINGS
+from deepshade.effects import EFFECTS, SETTINGS, Setting
 from deepshade.engines import Engine
 from deepshade.gbuffer import GBuffer, load_gbuffer
 from deepshade.machine import trim
@@ -130,12 +130,15 @@ def decode(
 ) -> GBuffer:
     """The G-buffer that the bundle's network needs, found or derived in the files.
 
-    Nothing else is decoded. Raises what `load_gbuffer` raises.
+    Nothing else is decoded. A blur circle that the files hold is of their lens: where another is
+    asked for, it is derived. Raises what `load_gbuffer` raises, and Problem 422 for a shutter
+    asked for where the header doesn't say which one the motion holds for.
     """
     needs = list(bundle.inputs)
+    new_lens = any(getattr(asked, name) is not None for name in LENS)
     if EFFECTS[bundle.effect].background == "light" and "light" not in needs:
         needs.append("light")
-    return load_gbuffer(
+    gbuffer = load_gbuffer(
         [(file.name, file.data) for file in files],
         needs,
         profile=asked.profile,
@@ -143,7 +146,22 @@ def decode(
         fov=asked.fov,
         limits=limits,
         headers=headers,
+        anew=("focal",) if new_lens and "focal" in needs else (),
     )
+    if asked.shutter is not None:
+        setting = SETTINGS["shutter"]
+        shutter = _stored(gbuffer, setting)
+        if not shutter:
+            raise Problem(
+                422,
+                "bad-parameter",
+                "shutter: motion can't be scaled, for the header doesn't say how long the shutter"
+                " is open that it holds for",
+                fix=f"write {setting.header}, in {setting.unit} above 0, or leave out ?shutter=",
+            )
+        gbuffer.attributes["motion"] *= np.float32(asked.shutter / shutter)
+        gbuffer.header[setting.header] = asked.shutter
+    return gbuffer
 
 
 def plan_shading(
@@ -239,19 +257,26 @@ def _giving_back(engine: Engine | None, need: Need) -> Iterator[None]:
 def _radius(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> tuple[float, str]:
     if asked.radius is not None:
         return asked.radius, "request"
-    setting = SETTINGS["radius"]
-    stored = gbuffer.header.get(setting.header)
-    if stored is None or "radius" not in EFFECTS[bundle.effect].settings:
+    if "radius" not in EFFECTS[bundle.effect].settings:
         return bundle.radius, "bundle"
+    radius = _stored(gbuffer, SETTINGS["radius"], "; ?radius= overrides it")
+    return (bundle.radius, "bundle") if radius is None else (radius, "header")
+
+
+def _stored(gbuffer: GBuffer, setting: Setting, instead: str = "") -> float | None:
+    """What the header says of a setting. Raises Problem 422 where it can't mean that."""
+    stored = gbuffer.header.get(setting.header)
+    if stored is None:
+        return None
     try:
-        radius = float(stored)
+        value = float(stored)
     except (TypeError, ValueError):
-        radius = float("nan")
-    if not setting.lowest <= radius <= setting.highest:
+        value = float("nan")
+    if not setting.lowest <= value <= setting.highest:
         raise Problem(
             422,
             "bad-header",
             f"the image's header says {setting.header} = {str(stored)[:60]}",
-            fix="it must be a positive number; ?radius= overrides it",
+            fix=f"it must be a number from {setting.lowest:g} to {setting.highest:g}{instead}",
         )
-    return radius, "header"
+    return value

@@ -27,8 +27,16 @@ def test_a_tensor_is_the_scaled_stack(name):
     )
     assert made.shape == (1, tensors.channel_count(effect.inputs, False), 8, 12)
     assert np.allclose(made[0, :, :6, :10], expected, rtol=1e-6)
-    assert not made[:, :, 6:].any()
-    assert not made[:, :, :, 10:].any()
+    # past the picture the background's own attributes go on, and nothing else is there
+    for attribute, place in tensors.channel_slices(effect.inputs, False).items():
+        inner, below, right = made[0, place, :6, :10], made[0, place, 6:], made[0, place, :6, 10:]
+        if ATTRIBUTES[attribute].in_background:
+            assert (below[..., :10] == inner[:, 5:]).all()
+            assert (right == inner[..., 9:]).all()
+            assert (below[..., 10:] == inner[:, 5:, 9:]).all()
+        else:
+            assert not below.any()
+            assert not right.any()
 
 
 @pytest.mark.parametrize("name", [n for n, e in EFFECTS.items() if e.per_channel])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -72,14 +72,15 @@ def load_gbuffer(
     fov: float | None = None,
     limits: Limits | None = None,
     headers: Sequence[Header] | None = None,
+    anew: Collection[str] = (),
 ) -> GBuffer:
     """Loads the attributes `needs` from one EXR file, or from several of one view.
 
     A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
     (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
     comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
-    What isn't there is derived (`derivation`), and `GBuffer.derived` says how. `headers` are what
-    `exr.read_header` gave for the same sources, to spare reading them again.
+    What isn't there, or is to be made `anew`, is derived (`derivation`): `GBuffer.derived` says how.
+    `headers` are what `exr.read_header` gave for the same sources, to spare reading them again.
 
     Raises ImageError, DamagedImageError, LimitError, MissingAttributeError,
     AmbiguousChannelError, CameraError, ConfigError.
@@ -94,6 +95,8 @@ def load_gbuffer(
     limits.check("channels", sum(len(p.channels) for header in headers for p in header.parts))
     limits.check("decoded_bytes", sum(header.decoded_bytes for header in headers))
     planned = plan_gbuffer(headers, stems, needs, profile=profile, mapping=mapping, fov=fov)
+    for name in anew:
+        planned.choices.pop(name, None)
     planned.require(needs)
     steps: dict[str, derivation.Derivation] = {}
     for name in needs:
