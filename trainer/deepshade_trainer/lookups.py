@@ -78,7 +78,7 @@ def picture(side: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     z = np.sqrt(np.where(ball, 1 - square, 0))
     gbuffer = np.zeros((1, 13, side, side), np.float32)
     gbuffer[0, :3] = np.stack([x, y, z]) * ball
-    gbuffer[0, 3:6] = np.stack([0.2 * x, 0.2 * y, np.ones_like(x)])
+    gbuffer[0, 3:6] = np.stack([-0.2 * x, -0.2 * y, np.ones_like(x)])
     gbuffer[0, 3:6] /= np.linalg.norm(gbuffer[0, 3:6], axis=0)
     gbuffer[0, 6:12] = 0.5 * ball
     gbuffer[0, 12] = 10 ** np.clip(2 + 2 * x, 0, 4) * ball
@@ -92,7 +92,7 @@ def _parity(shader: Reflections, path: Path, given: list[torch.Tensor]) -> float
     session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     worst = 0.0
     for up in ("y", "z"):
-        turn = torch.from_numpy(world_to_map(77.0, up).astype(np.float32))  # type: ignore[arg-type]
+        turn = torch.from_numpy(world_to_map(77.0, up).astype(np.float32))
         inputs = [*given[:-1], turn]
         feed = {node.name: t.numpy() for node, t in zip(session.get_inputs(), inputs, strict=True)}
         ours = session.run(None, feed)[0]

@@ -30,6 +30,11 @@ class Reflections(nn.Module):
     surface stands the environment behind it; where the view isn't known there, its mean.
     """
 
+    fits: Tensor
+    row: Tensor
+    column: Tensor
+    rows: Tensor
+
     def __init__(self, lobes: int = 1) -> None:
         super().__init__()
         self.lobes = lobes
