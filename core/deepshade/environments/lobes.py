@@ -123,7 +123,7 @@ def _resized(picture: Float, rows: int) -> Float:
             first, second = (picture.take(end, axis) for end in ends)
             picture = first + (second - first) * share
         return picture
-    energy: NDArray[np.float64] = picture * solid_angles(height, width)[:, None]
+    energy = picture.astype(np.float64) * solid_angles(height, width)[:, None]
     for axis, size in ((1, rows), (2, 2 * rows)):
         old = energy.shape[axis]
         if old % size == 0:
