@@ -82,7 +82,7 @@ def test_the_table_knows_what_is_known():
     """Face on nothing is cut off, and far above the horizon next to nothing is."""
     for exponent in (1, 30, 1000):
         assert phong._entry(1.0, exponent, 2)[0] == pytest.approx(0, abs=1e-4)
-        assert phong._entry(1.0, exponent, 2)[4] == pytest.approx(0, abs=0.01)
+        assert phong._entry(1.0, exponent, 2)[3] == pytest.approx(0, abs=0.01)
     assert phong._entry(0.6, 1000, 1)[0] == pytest.approx(0, abs=1e-3)
     # ∫ max(0, R·ω) max(0, N·ω) dω for N at a right angle to R is 2/3: times 3/(2π)
     assert phong._entry(0.0, 1, 1)[0] == pytest.approx(1 / np.pi, rel=1e-3)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.environments.environment import Environment, solid_angles
+from deepshade.threads import run_all, thread_count
 
 Float = NDArray[np.float32]
 
@@ -30,6 +31,7 @@ _FINEST = 512  # rows of the finest tile
 _COARSEST = 64
 _REACH = 5.0  # standard deviations (1 / √m) at which a lobe ends
 _FREQUENCIES = 6.0  # its spectrum ends at so many / its deviation
+_BLOCK = 32  # rows worked on together
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +82,15 @@ def prefilter(environment: Environment) -> Float:
     while (rows := min(maps)) > _COARSEST:
         maps[rows // 2] = _halved(maps[rows])
     low, high = environment.radiance.min((1, 2)), environment.radiance.max((1, 2))
-    for level, tile in enumerate(TILES[1:-1]):
+
+    def fill(level: int) -> None:
+        tile = TILES[level + 1]
         # halving has widened what it moved, and left a quarter of a new pixel's square
         widened = 0.25 * (math.pi / tile.rows) ** 2 * (1 - (tile.rows / _FINEST) ** 2)
         blurred = _blurred(maps[tile.rows], 1 / (2.0**-level - widened))
         _place(table, tile, np.clip(blurred, low[:, None, None], high[:, None, None]))
+
+    run_all(fill, range(LEVELS)[::-1], thread_count())  # the long ones first
     return table
 
 
@@ -164,19 +170,54 @@ def _halved(picture: Float) -> Float:
 def _blurred(picture: Float, exponent: float) -> Float:
     """(3, H, W): A(d, exponent) at the pixels' directions, of a map of that size."""
     rows, columns = picture.shape[1:]
-    step = math.pi / rows
     deviation = 1 / math.sqrt(exponent)
     # and wide lobes have an edge, at the horizon
     count = min(rows + 1, math.ceil(_FREQUENCIES / deviation) + 48)
-    reach = min(rows - 1, math.ceil(_REACH * deviation / step))
-    theta = (np.arange(rows // 2) + 0.5) * step
+    reach = min(rows - 1, math.ceil(_REACH * deviation / (math.pi / rows)))
     offsets = np.arange(-reach, reach + 1)
-    other = theta[:, None] + offsets * step  # of the rows that are summed
+    weights = solid_angles(rows, columns).astype(np.float32)
+    energy = np.fft.rfft(picture * weights[:, None], axis=2)[..., :count]
+    spectrum = np.zeros((3, rows, columns // 2 + 1), np.complex64)
+    halves = (
+        (energy, spectrum[:, : rows // 2]),
+        (energy[:, ::-1], spectrum[:, ::-1][:, : rows // 2]),
+    )
+    for top in range(0, rows // 2, _BLOCK):
+        block = np.arange(top, min(top + _BLOCK, rows // 2))
+        kernel = _kernel(block, offsets, rows, exponent, count)
+        at = np.clip(block[:, None] + offsets, 0, rows - 1)
+        kernel *= (1 / (kernel[..., 0] * weights[at]).sum(1))[:, None, None]
+        for source, target in halves:  # the south is the north of a mirrored map
+            for index, offset in enumerate(offsets):
+                first, last = max(top, -offset), min(top + block.size, rows - offset)
+                if first < last:
+                    moved = source[:, first + offset : last + offset]
+                    part = kernel[first - top : last - top, index]
+                    target[:, first:last, :count] += part * moved
+    return np.asarray(np.fft.irfft(spectrum, columns, axis=2), np.float32)
+
+
+def _kernel(
+    block: NDArray[np.intp],
+    offsets: NDArray[np.intp],
+    rows: int,
+    exponent: float,
+    count: int,
+) -> Float:
+    """(block, offsets, count): cosine series around the axis of the lobe between the rows `block`
+    and those `offsets` further, 0 where there are none."""
+    step = math.pi / rows
+    theta = (block + 0.5) * step
+    other = theta[:, None] + offsets * step
     there = (other > 0) & (other < math.pi)
     # 1 - cos γ of two pixels, exact where it is small: haversines of their angles
-    along = np.sin(np.arange(rows + 1) * (step / 2)) ** 2  # half the way around
     apart = 2 * np.sin(offsets * (step / 2)) ** 2
-    product = 2 * np.sin(theta)[:, None] * np.sin(other) * there
+    product = 2 * np.sin(theta)[:, None] * np.sin(other)
+    # how far around the axis the lobe reaches, half way at most
+    ends = 1 - math.cos(min(math.pi / 2, (_REACH + 0.5) / math.sqrt(exponent)))
+    sine = min(1.0, math.sqrt(ends / product[there].min()))
+    across = min(rows, math.ceil(2 * math.asin(sine) / step)) + 1
+    along = np.sin(np.arange(across) * (step / 2)) ** 2
     lobe = product.astype(np.float32)[..., None] * along.astype(np.float32)
     lobe += apart.astype(np.float32)[:, None]
     # cos γ ^ exponent, 0 below the horizon
@@ -186,25 +227,10 @@ def _blurred(picture: Float, exponent: float) -> Float:
     lobe *= np.float32(exponent)
     np.exp(lobe, out=lobe)
     lobe *= there[..., None]
-    # their cosine series: twice what lies between the two ends
-    series = np.cos(np.outer(np.arange(rows + 1), np.arange(count)) * step)
-    series[1:-1] *= 2
-    kernel = lobe.reshape(-1, rows + 1) @ series.astype(np.float32)
-    kernel = kernel.reshape(rows // 2, offsets.size, count)
-    weights = solid_angles(rows, columns).astype(np.float32)
-    energy = np.fft.rfft(picture * weights[:, None], axis=2)[..., :count]
-    at = np.clip(np.arange(rows // 2)[:, None] + offsets, 0, rows - 1)
-    total = (kernel[..., 0] * weights[at]).sum(1) * columns
-    kernel *= (columns / total)[:, None, None]
-    spectrum = np.zeros((3, rows, columns // 2 + 1), np.complex64)
-    halves = (
-        (energy, spectrum[:, : rows // 2]),
-        (energy[:, ::-1], spectrum[:, ::-1][:, : rows // 2]),
-    )
-    for source, target in halves:  # the south is the north of a mirrored map
-        for index, offset in enumerate(offsets):
-            first, last = max(0, -offset), min(rows // 2, rows - offset)
-            if first < last:
-                moved = source[:, first + offset : last + offset]
-                target[:, first:last, :count] += kernel[first:last, index] * moved
-    return np.asarray(np.fft.irfft(spectrum, columns, axis=2), np.float32)
+    # twice what lies between the two ends
+    series = np.cos(np.outer(np.arange(across), np.arange(count)) * step)
+    series[1:] *= 2
+    if across == rows + 1:
+        series[-1] /= 2
+    kernel = lobe.reshape(-1, across) @ series.astype(np.float32)
+    return np.asarray(kernel.reshape(block.size, offsets.size, count), np.float32)

@@ -29,11 +29,11 @@ def warped(mu: Array, exponent: Array) -> Array:
 
 
 def table(lobes: int) -> NDArray[np.float32]:
-    """(5, ROWS, COLUMNS) of E - max(μ, 0), a, b, c, and log2(m / (n + 1)), where
+    """(4 or 5, ROWS, COLUMNS) of E - max(μ, 0), a, b, log2(m / (n + 1)), and c, where
 
         ∫ K L dω ≈ E / 2 (A(a R + b N + c N×R, m) + A(a R + b N - c N×R, m)),
 
-    with c = 0 for one lobe. The directions' lengths don't matter.
+    with c = 0 for one lobe, which is left out. The directions' lengths don't matter.
     """
     found = np.zeros((5, ROWS, COLUMNS))
     for row in range(ROWS):
@@ -42,7 +42,7 @@ def table(lobes: int) -> NDArray[np.float32]:
         t = np.linspace(-1, 1, COLUMNS)
         for column, mu in enumerate(t / np.sqrt(1 + stretch * (1 - t * t))):
             found[:, row, column] = _entry(float(np.clip(mu, -1, 1)), exponent, lobes)
-    return found.astype(np.float32)
+    return found[: 3 + lobes].astype(np.float32)
 
 
 def _entry(mu: float, exponent: float, lobes: int) -> tuple[float, float, float, float, float]:
@@ -60,7 +60,7 @@ def _entry(mu: float, exponent: float, lobes: int) -> tuple[float, float, float,
     b = x / sine if sine > 1e-6 else 1 / (exponent + 1)
     a = z - b * mu
     c = math.sin(spread) / sine / math.cos(spread) if sine > 1e-6 else 0.0
-    return total - max(mu, 0.0), a, b, c, math.log2(max(m, 1.0) / (exponent + 1))
+    return total - max(mu, 0.0), a, b, math.log2(max(m, 1.0) / (exponent + 1)), c
 
 
 def _pair(length: float, wider: float, least: float) -> tuple[float, float]:

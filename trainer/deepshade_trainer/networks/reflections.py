@@ -57,7 +57,7 @@ class Reflections(nn.Module):
         gloss = gloss.clamp(0, 2.0 ** (LEVELS - 1) - 1)
         fit = self._fit(mu, gloss)
         share = torch.where(surface, fit[:, 0:1] + mu.clamp_min(0), 1)
-        level = (torch.log2(gloss + 1) + fit[:, 4:5]).clamp(0, LEVELS - 1)
+        level = (torch.log2(gloss + 1) + fit[:, 3:4]).clamp(0, LEVELS - 1)
         index = torch.floor(level).clamp_max(LEVELS - 2)
         part = torch.where(surface, level - index, 0)
         # the mean lies before the levels
@@ -66,7 +66,7 @@ class Reflections(nn.Module):
         if self.lobes == 1:
             seen = self._between(table, towards, index, part)
         else:
-            aside = fit[:, 3:4] * torch.cross(normal, mirrored, dim=1)
+            aside = fit[:, 4:5] * torch.cross(normal, mirrored, dim=1)
             seen = self._between(table, towards + aside, index, part)
             seen = 0.5 * (seen + self._between(table, towards - aside, index, part))
         shine = torch.where(surface, specular, 1) * (share.clamp_min(0) * seen)
@@ -74,7 +74,7 @@ class Reflections(nn.Module):
         return diffuse * spread + shine
 
     def _fit(self, mu: Tensor, gloss: Tensor) -> Tensor:
-        """(1, 5, H, W): see `phong.table`."""
+        """(1, 4 or 5, H, W): see `phong.table`."""
         stretch = (gloss + 1) / 8
         x = mu * torch.sqrt((1 + stretch) / (1 + stretch * mu * mu))
         y = torch.log2(gloss + 1) * (4 / (phong.ROWS - 1)) - 1
