@@ -1,4 +1,4 @@
-"""Writes a bundle of `ibl` that looks up what it answers: nothing of it is trained."""
+"""Writes bundles of image-based lighting, which look up what they answer: nothing is trained."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from deepshade.environments import INPUTS, Prepared, sky, world_to_map
 from deepshade.errors import DataError
 from deepshade_trainer.export import INPUT, OPSET, OUTPUT, TOLERANCE, quiet
 from deepshade_trainer.graph import bytes_per_pixel, fold_constants
-from deepshade_trainer.networks.reflections import Reflections
+from deepshade_trainer.networks.reflections import ATTRIBUTES, Reflections
 
 _SIDE = 96  # of the picture that parity is proven on
 
 
 def export_reflections(folder: Path, lobes: int = 1) -> tuple[Bundle, float]:
-    """The bundle `folder` (ibl/<name>), and how far ONNX Runtime strays from torch.
+    """The bundle `folder` (its last two names are effect and name), and its parity: how far ONNX
+    Runtime strays from torch.
 
     `lobes` as in `Reflections`. Raises DataError: too far.
     """
-    effect = EFFECTS["ibl"]
+    effect = EFFECTS[folder.parent.name]
     shader = Reflections(lobes).eval()
     folder.mkdir(parents=True, exist_ok=True)
     given = [torch.from_numpy(picture(_SIDE))]
@@ -52,7 +53,7 @@ def export_reflections(folder: Path, lobes: int = 1) -> tuple[Bundle, float]:
     config = {
         "effect": effect.name,
         "name": folder.name,
-        "inputs": effect.inputs,
+        "inputs": ATTRIBUTES,
         "outputs": effect.outputs,
         "radius": 1.0,
         "fov": 50.0,
@@ -70,7 +71,7 @@ def export_reflections(folder: Path, lobes: int = 1) -> tuple[Bundle, float]:
 
 
 def picture(side: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """(1, 13, side, side): a ball before nothing, glossier to the right, as `ibl` takes it."""
+    """(1, 13, side, side), as `Reflections` takes it: a ball before nothing, glossier to the right."""
     at = (np.arange(side) + 0.5) / side * 2.2 - 1.1
     x, y = np.broadcast_to(at, (side, side)), -np.broadcast_to(at[:, None], (side, side))
     square = x * x + y * y

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deepshade.effects import EFFECTS
 from deepshade.environments.lobes import HEIGHT, LEVELS, TILES, WIDTH
 from deepshade.tensors import channel_slices
 from deepshade_trainer.networks import phong
@@ -18,13 +17,16 @@ from deepshade_trainer.networks import phong
 _ATAN = np.polynomial.polynomial.polyfit(
     (x := np.cos(np.linspace(0, np.pi / 2, 400))[:-1]) ** 2, np.arctan(x) / x, 7
 )
+# of a surface under an environment: what a graph takes, in this order
+ATTRIBUTES = ("normal_world", "view", "diffuse", "specular", "gloss")
 _SURFACE = 0.25  # the square of a normal's length; background has none
 _TINY = 1e-12
 _SHARP = len(TILES) - 1  # the tile of the map itself
 
 
 class Reflections(nn.Module):
-    """A G-buffer of `ibl`, an environment's table and a turn to R_diff A(N, 1) + R_spec ∫ K L dω.
+    """A G-buffer (`ATTRIBUTES`), an environment's table and a turn to radiance,
+    R_diff A(N, 1) + R_spec ∫ K L dω.
 
     K, Phong's lobe over a surface, is replaced by one or two lobes (`phong`). Where there is no
     surface stands the environment behind it; where the view isn't known there, its mean.
@@ -38,7 +40,7 @@ class Reflections(nn.Module):
     def __init__(self, lobes: int = 1) -> None:
         super().__init__()
         self.lobes = lobes
-        self.places = channel_slices(EFFECTS["ibl"].inputs, False)
+        self.places = channel_slices(ATTRIBUTES, False)
         self.register_buffer("fits", torch.from_numpy(phong.table(lobes))[None])
         corners = np.array([(tile.row, tile.column, tile.rows) for tile in TILES], np.float32)
         for name, column in zip(("row", "column", "rows"), corners.T, strict=True):
