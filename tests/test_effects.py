@@ -126,11 +126,11 @@ def test_a_served_answer_is_the_networks(models: Path, local: Local, effect: str
     answer = shaded(local, effect, inputs)
     assert answer.shape == (len(EFFECTS[effect].outputs), HEIGHT, WIDTH)
     bundle = Bundle.load(models / effect / "balanced")
-    given = tensors.tensor(
-        EFFECTS[effect], inputs, bundle.inputs, RADIUS, per_channel=bundle.per_channel
-    )
     rows, columns = (tensors.up(side, bundle.size_multiple) for side in (64, 128))
-    given = np.pad(given, ((0, 0), (0, 0), (0, rows - HEIGHT), (0, columns - WIDTH)))
+    scale = tensors.length_scale(EFFECTS[effect], inputs, RADIUS)
+    runs = range(3) if bundle.per_channel else (None,)
+    planes = [tensors.planes(inputs, bundle.inputs, scale, channel=run) for run in runs]
+    given = np.concatenate([tensors.cut(each, (0, rows, 0, columns)) for each in planes])
     with torch.inference_mode():
         expected = from_bundle(bundle.path)(torch.from_numpy(given)).flatten(0, 1).numpy()
     expected = expected[:, :HEIGHT, :WIDTH].clip(*EFFECTS[effect].range)
@@ -187,7 +187,7 @@ def test_light_is_carried_in_every_precision(models: Path, effect: str, backend:
         return
     # of gi what would be negative is 0
     counts = np.ones(even.shape, bool) if effect != "gi" else (even > 0) & (alone > 0)
-    assert counts.mean() > 0.02
+    assert counts.mean() > 0.005
     assert (np.abs(both - even - alone) <= 1e-4 * (even + alone))[counts].all()
 
 

@@ -76,8 +76,8 @@ def test_every_effect_gets_its_row_s_background(effect):
     answer, plan, _ = shaded(effect, gbuffer, **config)
     there, empty = ~gbuffer.background, gbuffer.background
     assert answer.shape == (len(row.outputs), 90, 150)
-    inputs = tensor(row, gbuffer.attributes, row.inputs, 1.0, per_channel=row.per_channel)
-    inputs = np.pad(inputs, ((0, 0), (0, 0), (0, 128 - 90), (0, 256 - 150)))
+    runs = row.per_channel
+    inputs = tensor(row, gbuffer.attributes, row.inputs, 1.0, per_channel=runs, multiple=128)
     network = engine(bundle(effect, **config)).predict(inputs)[..., :90, :150]
     network = network.reshape(-1, 90, 150)
     np.testing.assert_array_equal(answer[:, there], network[:, there])

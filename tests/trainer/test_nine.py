@@ -126,6 +126,24 @@ def test_every_effect_trains_and_exports(effect: str, name: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
+def test_a_picture_is_padded_as_everywhere(effect: str) -> None:
+    row = EFFECTS[effect]
+    shader = Shader(row, build(small(effect, "balanced").network))
+    plain, padded = (
+        tensors.tensor(
+            row,
+            arrays(effect, 3, 33, 21),
+            row.inputs,
+            RADIUS,
+            per_channel=shader.per_channel,
+            multiple=multiple,
+        )
+        for multiple in (1, shader.size_multiple)
+    )
+    assert torch.equal(shader.padded(torch.from_numpy(plain)), torch.from_numpy(padded))
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
 def test_what_is_learnt_is_the_answer_on_its_curve(effect: str) -> None:
     """In training nothing is clamped; the answer is its curve's inverse, and finite."""
     row = EFFECTS[effect]

@@ -71,7 +71,7 @@ def export_reflections(folder: Path, lobes: int = 1) -> tuple[Bundle, float]:
 
 
 def picture(side: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """(1, 13, side, side), as `Reflections` takes it: a ball before nothing, glossier to the right."""
+    """(1, 13, side, side) for `Reflections`: a ball before nothing, glossier to the right."""
     at = (np.arange(side) + 0.5) / side * 2.2 - 1.1
     x, y = np.broadcast_to(at, (side, side)), -np.broadcast_to(at[:, None], (side, side))
     square = x * x + y * y

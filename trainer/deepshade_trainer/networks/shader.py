@@ -65,9 +65,22 @@ class Shader(nn.Module):
         return image if unbounded else image.clamp(*self.effect.range)
 
     def padded(self, gbuffer: Tensor) -> Tensor:
-        """(N, C, H, W) with zeros to the right and below, up to multiples of `size_multiple`."""
+        """(N, C, H, W) with more to the right and below, up to multiples of `size_multiple`.
+
+        That is what `deepshade.tensors` puts there.
+        """
         height, width = (-side % self.size_multiple for side in gbuffer.shape[2:])
-        return F.pad(gbuffer, (0, width, 0, height)) if height or width else gbuffer
+        if not height and not width:
+            return gbuffer
+        pieces = [
+            F.pad(
+                gbuffer[:, place],
+                (0, width, 0, height),
+                "replicate" if ATTRIBUTES[name].in_background else "constant",
+            )
+            for name, place in self.places.items()
+        ]
+        return torch.cat(pieces, 1)
 
     def on_curve(self, gbuffer: Tensor) -> Tensor:
         """(N, C, H, W) to the answer on the transfer curve (N, outputs, H, W): what is learnt."""

@@ -131,12 +131,15 @@ def _diffuse(
         near_light += share * brighter
         cell += 1
 
-    # Distances spread as s / (r + s)^2 up to the farthest corner of the picture: with s twice the
-    # mean free path nearly as R(r) r does, whose samples then have nearly equal weights.
+    # Distances spread as s / (r + s)^2 from where the nearest end to the farthest corner of the
+    # picture: with s twice the mean free path nearly as R(r) r does, whose samples then have nearly
+    # equal weights.
     spread = 2 * dr.mean(path)
     farthest = mi.Vector2f(dr.maximum(column, wide - column), dr.maximum(row, high - row) / aspect)
-    reach = dr.norm(farthest)
-    covered = reach / (reach + spread)
+    begin = (NEAR + 0.5) * dr.minimum(1, 1 / aspect)
+    reach = dr.maximum(dr.norm(farthest), 2 * begin)
+    inner = begin / (begin + spread)
+    covered = reach / (reach + spread) - inner
     stream = pixel_streams(width * height, seed ^ STREAM)
     columns, rows = strata(samples)
     across, count = dr.opaque(mi.UInt32, columns), dr.opaque(mi.UInt32, columns * rows)
@@ -144,7 +147,8 @@ def _diffuse(
 
     def far(stratum: Any, index: Any) -> tuple[Any, Any]:
         random = (stratum + random_pair(stream, index)) / size
-        r = spread * random.x * covered / (1 - random.x * covered)
+        share = dr.fma(random.x, covered, inner)
+        r = spread * share / (1 - share)
         sine, cosine = dr.sincos(dr.two_pi * random.y)
         at_x, at_y = column + r * cosine, row + r * sine * aspect
         x, y = mi.Int32(dr.floor(at_x)), mi.Int32(dr.floor(at_y))

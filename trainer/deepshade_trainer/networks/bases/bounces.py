@@ -137,7 +137,7 @@ class Bounces(Bases):
             told += [rise, cosine.clamp(-1, 1) * near, turned * near, distance * 0.25]
             above = horizon + rise
             towards.append(rise * (above + horizon) * 0.5)
-            sideways.append(_arc(above) + _arc(horizon) * -1)
+            sideways.append(_arc(horizon, above) * rise)
             seen.append(rise)
             close.append(near)
             sent.append(light)
@@ -199,10 +199,16 @@ def _spread(pooled: Tensor) -> list[Tensor]:
     return [means[spread] for spread in SPREADS]
 
 
-def _arc(c: Tensor) -> Tensor:
-    """∫ √(1 - c²) dc from 0, for cosines in [-1, 1]."""
-    square = c * c
-    return ((square * _ARC[2] + _ARC[1]) * square + _ARC[0]) * c
+def _arc(a: Tensor, b: Tensor) -> Tensor:
+    """The mean of √(1 - c²) over cosines c from a to b, both in [-1, 1].
+
+    Times b - a it is the integral, and exactly 0 where that is: engines round the difference of
+    two integrals to something else, which any light from beyond the radius would be seen by.
+    """
+    first, second, both = a * a, b * b, a * b
+    three = first + second + both
+    five = first * first + second * second + both * three
+    return five * _ARC[2] + three * _ARC[1] + _ARC[0]
 
 
 def _total(parts: Iterable[Tensor]) -> Tensor:
