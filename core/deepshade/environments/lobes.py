@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,7 +153,7 @@ def _halved(picture: Float) -> Float:
     A mean over four would shift a sun by up to half a pixel.
     """
     height, width = picture.shape[1:]
-    energy = picture * solid_angles(height, width)[:, None].astype(np.float32)
+    energy: NDArray[Any] = picture * solid_angles(height, width)[:, None].astype(np.float32)
     for axis in (1, 2):
         before = np.roll(energy, 1, axis)
         after = np.roll(energy, -1, axis)
