@@ -94,6 +94,9 @@ def table(found: Figures) -> list[str]:
             lines.append(f"| {name} in our time | none is as quick | | | | |")
         elif quick is not best:
             lines.append(_line(f"{name} in our time", quick, _setting(quick)))
+    if (floor := error["floor"]) is not None:
+        share = 100 * floor / error["trivial_dssim"]
+        lines.append(f"| noise in the reference | | {_short(floor)} | {share:.1f} % | | |")
     return lines
 
 
@@ -233,7 +236,7 @@ def _short(value: float | None) -> str:
 
 
 def _ms(point: Point) -> str:
-    return f"{point.milliseconds:.3g}" if point.milliseconds < 1000 else "over 1000"
+    return f"{point.milliseconds:.3g}" if point.milliseconds < 100 else f"{point.milliseconds:.0f}"
 
 
 def _scene(view: View) -> str:

@@ -107,7 +107,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, help="at most; default: all that show something")
     options = parser.parse_args()
     views = load_views(options.data, options.effect, options.views)
-    result: dict[str, Any] = {"scenes": [view.scene for view in views]}
+    result: dict[str, Any] = {"scenes": [Path(view.scene).name for view in views]}
     for name in getattr(baselines.folder(options.effect), "METHODS", {}).values():
         module = import_module(f"{baselines.__name__}.{options.effect}.{name}")
         if subject := getattr(module, "TUNABLE", None):

@@ -36,7 +36,8 @@ class View:
     `attributes` are (C, H, W) by name, camera space and scene units, zero where `background`
     (H, W) is true, but for those that say something there. `reference` is (C', H, W). `radius` is
     the effect's, in scene units. The `camera` may show more: the view is then a window of its
-    frame. `record` is what the data set's manifest keeps to render the view again.
+    frame. `record` is what the data set's manifest keeps to render the view again. `error` is the
+    reference's standard error, where that is known.
     """
 
     scene: str
@@ -47,6 +48,7 @@ class View:
     radius: float
     camera: Camera
     record: Mapping[str, Any] = field(default_factory=dict)
+    error: Float | None = None
 
     @property
     def height(self) -> int:
@@ -79,6 +81,17 @@ class View:
         names = [name for name in self.effect.inputs if ATTRIBUTES[name].unit is RADIANCE]
         return self.attributes[names[0]] if names else None
 
+    def floor(self) -> float | None:
+        """DSSIM that noise in the reference leaves to a perfect answer, at least.
+
+        That of the reference with as much noise again, which is near where noise is weak and too
+        little where it is strong; None where the reference's error isn't known.
+        """
+        if self.error is None:
+            return None
+        noise = np.random.default_rng(0).standard_normal(self.reference.shape, np.float32)
+        return self.dssim(self.reference + noise * self.error)
+
     def contrast(self) -> float:
         """What the effect's row compares with `min_contrast`."""
         return judging.contrast(self.effect, self.reference, self.trivial())
@@ -95,7 +108,8 @@ def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View
             f"{folder} has no {', '.join(sorted(missing))}",
             fix=f"render it with --effects {effect}",
         )
-    names = [name for name in manifest.schema if name in ATTRIBUTES] + [f"reference_{effect}"]
+    own = {f"reference_{effect}", f"reference_{effect}_error"}
+    names = [name for name in manifest.schema if name in ATTRIBUTES or name in own]
     found: list[View] = []
     for shard in manifest.shards:
         path = shard_path(folder, shard)
@@ -128,14 +142,16 @@ def _read(
             for index, record in enumerate(records):
                 planes = {name: plane[index].astype(np.float32) for name, plane in stored.items()}
                 reference = planes.pop(f"reference_{effect.name}")
+                error = planes.pop(f"reference_{effect.name}_error", None)
                 background, _ = remove(planes, list(planes))
                 known = record["camera"]
                 frame = known["fov"], *known["frame"], known["world_to_camera"], *known["origin"]
                 radius = float(record.get("radius") or 1.0)
                 scene, camera = str(record["scene"]), Camera(*frame)
-                yield View(scene, effect, planes, background, reference, radius, camera, record)
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise DataError(f"{path} can't be read: {error!r}") from error
+                made = effect, planes, background, reference, radius, camera, record, error
+                yield View(scene, *made)
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as problem:
+        raise DataError(f"{path} can't be read: {problem!r}") from problem
 
 
 def fullest(views: Sequence[View]) -> View:
@@ -150,7 +166,7 @@ def resized(view: View, height: int = HEIGHT, width: int = WIDTH) -> View:
     """
     planes = {name: _fit(plane, height, width) for name, plane in view.attributes.items()}
     empty, answer = _fit(view.background, height, width), _fit(view.reference, height, width)
-    return replace(view, attributes=planes, background=empty, reference=answer)
+    return replace(view, attributes=planes, background=empty, reference=answer, error=None)
 
 
 def body(view: View, height: int = HEIGHT, width: int = WIDTH, *, grain: bool = False) -> bytes:

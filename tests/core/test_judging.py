@@ -31,9 +31,18 @@ def test_light_is_judged_alike_at_any_exposure(factor: float) -> None:
     once = judging.contrast(effect, reference, blank)
     brighter = [(image * np.float32(factor)).astype(np.float32) for image in (reference, blank)]
     assert judging.contrast(effect, *brighter) == pytest.approx(once, rel=1e-4)
+    apart = judging.relative(brighter[0], brighter[1])
+    assert apart == pytest.approx(judging.relative(reference, blank), rel=1e-4)
     white = np.percentile(reference, 99)
     by_hand = (np.clip(image / white, 0, 1) for image in (blank, reference))
     assert once == pytest.approx(metrics.dssim(*by_hand), rel=1e-4)
+
+
+def test_a_relative_error_counts_what_is_brighter_than_white() -> None:
+    reference = np.ones((3, 10, 10), np.float32)
+    image = reference.copy()
+    image[:, 0, 0] = 3
+    assert judging.relative(reference, image) == pytest.approx(2 / 4.01 / 100, rel=1e-6)
 
 
 def test_what_is_compared_is_finite_and_in_range() -> None:

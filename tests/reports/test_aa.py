@@ -14,13 +14,16 @@ from deepshade_report.view import Float, View
 from .plates import noise, plates
 
 try:
-    from deepshade_report.baselines.aa import areas, fxaa, smaa
+    import drjit as dr
+
+    from deepshade_report.baselines.aa import areas, cmaa2, fxaa, smaa
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
     pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
 
 SMAA = [setting for setting in smaa.SETTINGS if setting[2] >= 16]
 ALL = [
     *(smaa.smaa(*setting, smaa.PUBLISHED) for setting in smaa.SETTINGS),
+    *(cmaa2.cmaa2(*setting, cmaa2.PUBLISHED) for setting in cmaa2.SETTINGS),
     *(fxaa.fxaa(preset, fxaa.PUBLISHED) for preset in fxaa.SETTINGS),
 ]
 
@@ -63,6 +66,25 @@ def test_smaa_comes_near_an_edge_s_coverage(setting: Any, degrees: float) -> Non
     assert improvement(smaa.smaa(*setting, smaa.PUBLISHED), degrees) >= limit
 
 
+@pytest.mark.parametrize("degrees", [8.0, 172.0, 82.0, 98.0])
+@pytest.mark.parametrize("setting", cmaa2.SETTINGS)
+def test_cmaa2_comes_near_an_edge_s_coverage(setting: Any, degrees: float) -> None:
+    assert improvement(cmaa2.cmaa2(*setting, cmaa2.PUBLISHED), degrees) > 2
+
+
+@pytest.mark.parametrize("degrees", [8.0, 20.0])
+def test_cmaa2_turns_with_the_picture(degrees: float) -> None:
+    method = cmaa2.cmaa2(*cmaa2.SETTINGS[3], cmaa2.PUBLISHED)
+    light = slanted(degrees)[0].attributes["light"]
+    flat = np.ones(light.shape[1:])
+    upright = shaded(method, plates("aa", light=light, depth=flat))
+    assert (upright != light).any()
+    for turns in (1, 2, 3):
+        turned = np.rot90(light, turns, (1, 2))
+        image = shaded(method, plates("aa", light=turned, depth=flat))
+        assert np.rot90(image, -turns, (1, 2)) == pytest.approx(upright, abs=1e-6)
+
+
 @pytest.mark.parametrize("degrees", [8.0, 82.0, 98.0])
 @pytest.mark.parametrize("preset", fxaa.SETTINGS)
 def test_fxaa_comes_nearer_to_an_edge_s_coverage(preset: int, degrees: float) -> None:
@@ -90,6 +112,16 @@ def test_exposure_changes_nothing(method: Any) -> None:
     assert one.max() <= light.max() * 1.001
 
 
+@pytest.mark.parametrize("make", [smaa.TUNABLE, cmaa2.TUNABLE, fxaa.TUNABLE])
+def test_what_was_recorded_for_one_view_shades_another(make: Any) -> None:
+    method, depth = make.make(make.published), np.ones((32, 48))
+    shaded(method, plates("aa", light=noise(seed=1), depth=depth))
+    replayed = shaded(method, plates("aa", light=noise(seed=2), depth=depth))
+    with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
+        traced = shaded(method, plates("aa", light=noise(seed=2), depth=depth))
+    assert replayed == pytest.approx(traced, rel=1e-5)
+
+
 def test_areas_along_diagonals_are_what_counting_finds() -> None:
     table = areas.diagonal_areas().numpy().reshape(4, 4, areas.DIAGONAL, areas.DIAGONAL, 2)
     left, right = 2, 3
@@ -101,6 +133,6 @@ def test_areas_along_diagonals_are_what_counting_finds() -> None:
     assert table[2, 2, left, right] == pytest.approx(expected, abs=2e-3)
 
 
-@pytest.mark.parametrize("module", [smaa, fxaa])
+@pytest.mark.parametrize("module", [smaa, cmaa2, fxaa])
 def test_quick_is_fewer(module: Any) -> None:
     assert len(module.methods(True)) < len(module.methods(False))

@@ -79,9 +79,9 @@ def test_the_page_says_what_was_measured_and_what_was_not(root: Path) -> None:
     assert "fewer than the 32" in section
     assert text.count("[Indirect light](#gi)") == 1
     for name in re.findall(r"!\[[^]]*]\(([^)]*)\)", section):
-        picture = Image.open(root / "docs" / name)
-        assert picture.format == "WEBP"
-        assert picture.height == 2 * SIZE + pictures.GAP
+        with Image.open(root / "docs" / name) as picture:
+            assert picture.format == "WEBP"
+            assert picture.height == 2 * SIZE + pictures.GAP
 
     text, _ = made(root, paper=False)
     assert "Left out: the paper's network (no bundle of it" in text

@@ -18,6 +18,8 @@ from .walls import degenerate, groove, rubble
 try:
     from deepshade_report.baselines.gi import bitmask as module
     from deepshade_report.baselines.gi.bitmask import Parameters, bitmask
+    from deepshade_report.baselines.gi.onelayer import Parameters as Thick
+    from deepshade_report.baselines.gi.onelayer import onelayer
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
     pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
 
@@ -109,3 +111,34 @@ def test_the_settings_go_from_cheap_to_best_and_quick_is_fewer() -> None:
     samples = [math.prod(method.settings.values()) for method in module.methods(False)]
     assert samples == sorted(set(samples))
     assert len(module.methods(True)) < len(samples)
+
+
+def test_marched_rays_meet_the_other_strip_within_the_radius() -> None:
+    # as for two perpendicular strips above: what x away meets the wall, within R = 1
+    view = groove(45, 45, size=128)
+    view = replace(view, radius=view.radius * 0.4)
+    image = shaded(onelayer(128, Thick(0.5)), lit(view))
+    u, v = np.random.default_rng(1).random((2, 100_000))
+    towards = np.sqrt(u) * np.cos(2 * math.pi * v)  # a direction's part towards the wall
+    for pixels in (8, 20):
+        x = 2 / 128 * math.tan(math.radians(4)) * pixels / math.cos(math.radians(45)) / view.radius
+        found = float(image[0, 60:68, 64 + pixels - 2 : 64 + pixels + 2].mean())
+        assert found == pytest.approx((towards > x).mean(), rel=0.06, abs=0.01)
+
+
+def test_marched_rays_carry_light_linearly_and_a_plane_not_at_all() -> None:
+    view, rng = rubble(), np.random.default_rng(5)
+    a, b = rng.random((2, 3, 64, 64)).astype(np.float32)
+    first, second, both = (shaded(onelayer(8), lit(view, x)) for x in (a, b, 3 * a + 1e3 * b))
+    assert first.mean() > 0.005
+    assert both == pytest.approx(3 * first + 1e3 * second, rel=1e-4, abs=1e-3)
+    assert not first[:, view.background].any()
+    assert shaded(onelayer(8), lit(groove(0, 0, size=64))).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", degenerate())
+def test_no_input_makes_marched_rays_nonsense(name: str) -> None:
+    view = degenerate()[name]
+    image = shaded(onelayer(4), lit(view))
+    assert image.shape == (3, *view.background.shape)
+    assert (np.isfinite(image) & (image >= 0)).all()

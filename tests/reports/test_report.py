@@ -26,6 +26,7 @@ from deepshade_report.method import Network
 from deepshade_report.sections import Point, Skipped, frontier, points, same_time, summary
 from deepshade_report.view import body, load_views, resized
 
+from .plates import plates
 from .small import SIZE, write_bundle, write_data
 
 
@@ -138,6 +139,27 @@ def test_bodies_hold_the_view_at_any_size_and_compress_like_real_ones(root: Path
     for axis, plane in zip("XYZ", position, strict=True):
         assert np.allclose(image[f"position.{axis}"], plane, rtol=4e-3, atol=1e-6)
     assert len(grained) > 2 * len(body(view, 300, 400))
+
+
+def test_the_floor_is_what_noise_in_the_reference_leaves() -> None:
+    truth, rng = np.full((3, 64, 64), 2.0, np.float32), np.random.default_rng(5)
+    error = np.full_like(truth, 0.01)
+    noisy = truth + error * rng.standard_normal(truth.shape, np.float32)
+    view = plates("mb", depth=np.ones((64, 64)), motion=np.ones((2, 64, 64)), light=truth)
+    assert view.floor() is None
+    view = dataclasses.replace(view, reference=noisy, error=error)
+    assert view.floor() == pytest.approx(view.dssim(truth), rel=0.1)
+
+
+def test_a_body_keeps_what_is_infinitely_far() -> None:
+    depth = np.full((9, 12), 3.0)
+    depth[:4] = np.inf
+    motion = np.full((2, 9, 12), 1e6)
+    view = plates("mb", depth=depth, motion=motion, light=np.full((9, 12), 1e6))
+    image = exr.read(body(view, 9, 12)).pixels
+    assert (image["Z"] == depth).all()
+    assert np.isfinite(image["motion.U"]).all()
+    assert np.isfinite(image["light.R"]).all()
 
 
 def made_up() -> dict[str, Any]:

@@ -7,7 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from deepshade_trainer.networks.bases.bounces import CELL, Bounces
+from deepshade_trainer.networks.bases.bounces import (
+    CELL,
+    DIRECTIONS,
+    RAYS,
+    RINGS,
+    TURNS,
+    Bounces,
+    _moved,
+    _offset,
+)
 
 SIZE = 64
 
@@ -169,3 +178,22 @@ def test_background_light_is_nobodys(bounces: Bounces) -> None:
     sky = gbuffer.clone()
     sky[:, 6:] += 1e4 * (gbuffer[:, 5:6] == 0)
     torch.testing.assert_close(answer(bounces, sky), answer(bounces, gbuffer))
+
+
+def test_cells_that_take_turns_look_at_the_cells_their_rays_pass() -> None:
+    height, width = 12, 20
+    x = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(4))
+    for ring in RINGS[:5]:
+        found = _moved(x, ring).reshape(RAYS, TURNS, TURNS, height // TURNS, width // TURNS)
+        for ray, a, b, i, j in np.ndindex(*found.shape):
+            right, down = _offset(ring, ray, a * TURNS + b)
+            row, column = TURNS * i + a + down, TURNS * j + b + right
+            inside = 0 <= row < height and 0 <= column < width
+            expected = x[0, 0, row, column] if inside else 1e4
+            assert found[ray, a, b, i, j] == expected
+
+
+def test_neighbours_together_look_all_around() -> None:
+    angles = np.sort([np.arctan2(up, right) for turns in DIRECTIONS for right, up in turns])
+    steps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
+    np.testing.assert_allclose(steps, 2 * np.pi / len(angles), atol=1e-6)

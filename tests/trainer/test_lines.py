@@ -11,8 +11,8 @@ from deepshade_trainer.networks.bases.lines import Lines
 
 def _shaded(gbuffer: Tensor) -> Tensor:
     bases = Lines()
-    _, state = bases.features(gbuffer)
-    return bases.carry(state, torch.zeros(len(gbuffer), bases.weights, *gbuffer.shape[2:]))
+    told, state = bases.features(gbuffer)
+    return bases.carry(state, torch.zeros(len(gbuffer), bases.weights, *told.shape[2:]))
 
 
 def _random(height: int = 96, width: int = 96) -> Tensor:
@@ -52,6 +52,30 @@ def test_both_senses_of_a_motion_give_the_same_picture() -> None:
     reversed_ = gbuffer.clone()
     reversed_[:, :2] *= -1
     torch.testing.assert_close(_shaded(reversed_), _shaded(gbuffer), rtol=1e-4, atol=1e-5)
+
+
+def _turned(degrees: float) -> Tensor:
+    """What a network is told of a scene whose motion points there."""
+    gbuffer = torch.ones(1, 6, 32, 32)
+    angle = torch.deg2rad(torch.tensor(degrees))
+    gbuffer[:, 0], gbuffer[:, 1] = 12 * torch.cos(angle), 12 * torch.sin(angle)
+    return Lines().features(gbuffer)[0]
+
+
+@pytest.mark.parametrize("degrees", [0.0, 90.0, 180.0, 270.0])
+def test_told_of_directions_without_a_seam(degrees: float) -> None:
+    """Half a degree to either side is told alike: also at 180, where an angle would jump."""
+    assert (_turned(degrees - 0.5) - _turned(degrees + 0.5)).abs().max() < 0.03
+
+
+def test_told_of_rest_without_a_direction() -> None:
+    told = []
+    for u, v in ((0.0, 0.0), (1e-3, 0.0), (-1e-3, 0.0), (0.0, 1e-3), (0.0, -1e-3)):
+        gbuffer = torch.ones(1, 6, 32, 32)
+        gbuffer[:, 0], gbuffer[:, 1] = u, v
+        told.append(Lines().features(gbuffer)[0])
+    for each in told[1:]:
+        torch.testing.assert_close(each, told[0], atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("near", [True, False])

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,22 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
+from deepshade import exr
 from deepshade.camera import Camera
+from deepshade.environments.stored import read_stored, stored_path
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
-from deepshade.manifest import Manifest
-from deepshade_workers.datagen import DataSpec, expand_scenes, generate, make_sample, make_shard
+from deepshade.manifest import Manifest, Shard
+from deepshade_workers.datagen import (
+    DataSpec,
+    _complete,
+    expand_scenes,
+    generate,
+    make_sample,
+    make_shard,
+)
+from deepshade_workers.maps import MAX_HEIGHT
+from deepshade_workers.records import view_of
 from deepshade_workers.render import render_sample
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.procedural import FAMILIES
@@ -113,6 +125,68 @@ def test_shards_hold_light_and_lengths(tmp_path: Path) -> None:
         assert (found[name] == 70_001).all()
 
 
+@pytest.fixture(scope="module")
+def surrounded(tmp_path_factory: Any) -> tuple[DataSpec, Path, Shard]:
+    """A shard of the three effects under environments: maps of a folder, of any size, and skies."""
+    maps = tmp_path_factory.mktemp("maps")
+    for height in (300, 24):
+        bright = np.random.default_rng(height).random((3, height, 2 * height)).astype(np.float32)
+        exr.write(maps / f"{height}.exr", dict(zip("RGB", bright, strict=True)))
+    spec = replace(
+        SPEC,
+        scenes=("procedural:stairs:7",),
+        views=5,
+        shard_size=5,
+        effects=("do", "full"),
+        environments=str(maps),
+        skies=2,
+        layers=("do_visibility",),
+    )
+    out = tmp_path_factory.mktemp("surrounded")
+    return spec, out, make_shard(spec, 0, out, lambda: None)
+
+
+@pytest.mark.slow
+def test_each_view_has_its_environment(surrounded: tuple[DataSpec, Path, Shard]) -> None:
+    """A map and a turn are drawn for each; the shard's record leads to the very map."""
+    _, out, shard = surrounded
+    names = {record["environment"] for record in shard.samples}
+    assert names & {"300", "24"}
+    assert any(name.startswith("sky-") for name in names)
+    assert len({record["rotate"] for record in shard.samples}) == 5
+    tensors = load_file(out / shard.file)
+    assert tensors["reference_do_visibility"].shape == (5, 16, 32, 32)
+    for index, record in enumerate(shard.samples):
+        found = read_stored(out, record["environment_sha256"], record["environment"])
+        assert found.shape[0] <= MAX_HEIGHT
+        scene = open_scene(record["scene"])
+        view = view_of(record, scene, out)
+        images = render_sample(
+            scene, view, 32, 32, effects=("do", "full"), samples=16, seed=record["seed"]
+        )
+        for name in ("reference_do", "reference_full"):
+            assert (images[name] == tensors[name][index]).all()
+
+
+@pytest.mark.slow
+def test_a_lost_map_is_written_again(surrounded: tuple[DataSpec, Path, Shard]) -> None:
+    spec, out, shard = surrounded
+    manifest = Manifest(spec.settings(), {}).with_shard(shard)
+    assert _complete(spec, 0, manifest, out)
+    lost = stored_path(out, shard.samples[2]["environment_sha256"])
+    lost.unlink()
+    assert not _complete(spec, 0, manifest, out)
+    assert make_shard(spec, 0, out, lambda: None).sha256 == shard.sha256
+    assert lost.is_file()
+
+
+def test_without_environments_settings_stay_as_they_were() -> None:
+    """Data sets that were begun before there were any go on."""
+    assert not {"environments", "skies", "layers"} & set(SPEC.settings())
+    with_sky = replace(SPEC, effects=("do",))
+    assert with_sky.settings()["skies"] == SPEC.skies
+
+
 def test_scene_names_expand(tmp_path: Path) -> None:
     assert len(expand_scenes(["procedural"])) == len(FAMILIES)
     assert expand_scenes(["procedural:room:7"]) == ("procedural:room:7",)
@@ -134,6 +208,9 @@ def test_scene_names_expand(tmp_path: Path) -> None:
         {"shard_size": 0},
         {"radius": -1.0},
         {"effects": ("ao", "nothing")},
+        {"layers": ("visibility",)},
+        {"effects": ("do",), "skies": 0},
+        {"effects": ("do",), "environments": "/nowhere"},
     ],
 )
 def test_impossible_jobs_are_refused(change: dict[str, Any]) -> None:

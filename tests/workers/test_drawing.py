@@ -22,9 +22,9 @@ from deepshade_workers.view import Limits, View
 from deepshade_workers.viewpoints import sample_view
 
 SCENE = "procedural:crockery:1"
-LIGHT_EFFECTS = tuple(
-    name for name in references.known() if DataSpec((SCENE,), 1, effects=(name,)).limits
-)
+SPECS = {name: DataSpec((SCENE,), 1, effects=(name,)) for name in references.known()}
+# Environments lie beside a data set: test_datagen has their records.
+LIGHT_EFFECTS = tuple(name for name, spec in SPECS.items() if spec.limits and not spec.surrounded)
 
 
 def drawn(seed: int, limits: Limits | None = None) -> View:

@@ -12,6 +12,7 @@ import pytest
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.cli import main
+from deepshade.environments import sky
 from deepshade.gbuffer import load_gbuffer
 from deepshade_workers.scenes.scene import SKY_RADIANCE, SUN_DIRECTION, SUN_IRRADIANCE, Scene
 
@@ -82,6 +83,30 @@ def test_the_sun_lights_what_faces_it(tmp_path: Path) -> None:
     assert diffuse.mean() == pytest.approx(0.7 / np.pi * irradiance, rel=0.02)
 
 
+def test_an_environment_is_named_in_the_header(tmp_path: Path) -> None:
+    """The same file again under the map that a data set would keep: found by its hash."""
+    made = sky(height=16)
+    path = tmp_path / "dusk.exr"
+    exr.write(path, dict(zip("RGB", made.radiance, strict=True)))
+    options = ["--spp", "32", "--aperture", "0.1", "--environment", str(path), "--rotate", "30"]
+    options += ["--effects", "do,ibl,full", "--layers", "do_visibility"]
+    assert main(["render", SCENE, "-o", str(tmp_path / "a.exr"), *VIEW, *options]) == 0
+    found = exr.read(tmp_path / "a.exr")
+    header = found.header.parts[0].attributes
+    assert header["deepshade:environment"] == "dusk"
+    assert header["deepshade:rotate"] == 30
+    assert header["deepshade:environment_sha256"] == made.sha256
+    for effect in ("do", "ibl", "full"):
+        planes = [found.pixels[f"reference_{effect}.{letter}"] for letter in "RGB"]
+        assert np.isfinite(planes).all()
+        assert np.min(planes) >= 0
+        assert np.std(planes) > 0.05
+    # The first harmonic is visibility itself.
+    open_ = found.pixels["reference_do_visibility.00"] * np.sqrt(4 * np.pi)
+    assert open_.max() == pytest.approx(1, abs=1e-5)
+    assert "reference_do_visibility_error.15" in found.pixels
+
+
 def test_only_the_attributes_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "few.exr"
     options = ["--spp", "2", "--attributes", "normal,depth", "--json"]
@@ -106,7 +131,10 @@ def test_json_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["--size", "0x5"], "--size"),
         (["--size", "big"], "--size"),
         (["--effects", "aoo"], "ao"),
-        (["--effects", "ibl"], "no reference for 'ibl'; there are: aa, ao"),
+        (["--effects", "ibl"], "ibl needs an environment map: --environment FILE"),
+        (["--environment", "nothing.hdr"], "nothing.hdr"),
+        (["--environment", "sky", "--rotate", "inf"], "rotate"),
+        (["--layers", "visibility"], "do_visibility"),
         (["--radius", "-1"], "radius"),
         (["--radius", "nan"], "radius"),
         (["--fov", "180"], "field of view"),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from deepshade_workers.environments import EnvironmentLight
     from deepshade_workers.view import Light
 
 Vector = tuple[float, float, float]
@@ -59,8 +60,21 @@ def render(
         list[str] | None,
         typer.Option(help="NAME=X,Y,Z: how an object moves in the open shutter; repeatable."),
     ] = None,
+    environment: Annotated[
+        str | None,
+        typer.Option(
+            help="Environment map (EXR or HDR, latitude-longitude) for do, ibl and full, "
+            "or 'sky' for a generated one."
+        ),
+    ] = None,
+    rotate: Annotated[
+        float, typer.Option(help="Degrees to turn it by, counter-clockwise from above.")
+    ] = 0.0,
     attributes: Annotated[
         str, typer.Option(help="Attributes to write, commas between.  [default: all]")
+    ] = "",
+    layers: Annotated[
+        str, typer.Option(help="More to render, commas between: do_visibility.")
     ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
@@ -72,13 +86,16 @@ def render(
 
       deepshade render room.gltf -o out.exr --eye 0 1.5 3 --target 0 1 0 --effects ao,gi \
         --lamp 1 2.2 1 --lamp-size 0.1 --aperture 0.2 --move "chair=0.2,0,0"
+
+      deepshade render room.gltf -o out.exr --eye 0 1.5 3 --target 0 1 0 --effects do,ibl,full \
+        --environment studio.hdr --rotate 90 --aperture 0.2
     """
     import math
 
     from deepshade.attributes import ATTRIBUTES
     from deepshade.camera import Camera
     from deepshade.errors import ConfigError
-    from deepshade_workers.references import require
+    from deepshade_workers.references import layer_of, require
     from deepshade_workers.render import render as render_view
     from deepshade_workers.scenes.loading import open_scene
     from deepshade_workers.view import View
@@ -87,6 +104,9 @@ def render(
         raise ConfigError("radius", detail=f"the radius must be above 0, not {radius}")
     names = _listed(effects)
     require(names)
+    more = _listed(layers)
+    for name in more:
+        layer_of(name)
     chosen = _listed(attributes)
     for name in chosen:
         if name not in ATTRIBUTES:
@@ -102,10 +122,11 @@ def render(
         shutter=1.0,
         displacements=dict(_motion(text) for text in move or []),
         light=_light(lamp, lamp_size, lamp_power, sky, target),
+        surroundings=_surroundings(environment, rotate),
     )
     shown = chosen or list(ATTRIBUTES)
     figures = render_view(
-        opened, view, output, effects=names, attributes=shown, samples=spp, seed=seed
+        opened, view, output, effects=names, attributes=shown, layers=more, samples=spp, seed=seed
     )
     if as_json:
         typer.echo(json.dumps(figures))
@@ -146,6 +167,23 @@ def _light(
         power = 0.0 if lamp is None else 2 * math.dist(lamp, target) ** 2
     bright = 0.3 if sky is None else sky
     return Light(lamp or target, size, (power,) * 3, *[(bright,) * 3] * 3)
+
+
+def _surroundings(name: str | None, rotation: float) -> EnvironmentLight | None:
+    """The environment in the file `name`; None where none is asked for."""
+    import math
+
+    from deepshade import environments
+    from deepshade.errors import ConfigError
+    from deepshade_workers.environments import EnvironmentLight
+
+    if not math.isfinite(rotation):
+        raise ConfigError("rotate", detail=f"--rotate must be finite, not {rotation}")
+    if name is None:
+        return None
+    made = name == "sky" and not Path(name).exists()
+    found = environments.sky() if made else environments.read_environment(name)
+    return EnvironmentLight.of(found, rotation)
 
 
 def _listed(text: str) -> list[str]:
@@ -197,6 +235,16 @@ def datagen(
     textures: Annotated[
         Path | None, typer.Option(help="Folder of pictures for textures, beside generated ones.")
     ] = None,
+    environments: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of environment maps for do, ibl and full, beside generated skies."
+        ),
+    ] = None,
+    skies: Annotated[int, typer.Option(help="How many different skies.", min=0)] = 64,
+    layers: Annotated[
+        str, typer.Option(help="More to render, commas between: do_visibility.")
+    ] = "",
     shard_size: Annotated[int, typer.Option(help="Samples in a shard.", min=1)] = 128,
     address: Annotated[
         str | None, typer.Option(help="A running Ray cluster.  [default: one of its own]")
@@ -212,6 +260,9 @@ def datagen(
 
       deepshade datagen --out data/light --scenes procedural --scenes compose:furniture+plants \
         --effects ao,gi --textures pictures --views 2048
+
+      deepshade datagen --out data/env --scenes procedural --effects do,ibl,full \
+        --environments maps --layers do_visibility --views 2048
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
@@ -232,6 +283,9 @@ def datagen(
         max_motion=max_motion,
         max_scatter=max_scatter,
         textures=None if textures is None else str(textures),
+        environments=None if environments is None else str(environments),
+        skies=skies,
+        layers=tuple(_listed(layers)),
     )
     begun = time.monotonic()
     done, fresh = _watched(generate(spec, out, address=address), hidden=as_json)

@@ -8,17 +8,19 @@ import os
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from deepshade.effects import EFFECTS
+from deepshade.environments.stored import store, stored_path
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import NAME, Manifest, Shard
-from deepshade_workers.references import require
+from deepshade_workers.maps import map_files
+from deepshade_workers.references import layer_of, require
 from deepshade_workers.scenes.loading import (
     COMPOSED,
     PROCEDURAL,
@@ -29,7 +31,7 @@ from deepshade_workers.scenes.loading import (
 )
 from deepshade_workers.scenes.procedural import FAMILIES
 from deepshade_workers.shards import schema, shard_name, write_shard
-from deepshade_workers.view import Images, Limits, Vector
+from deepshade_workers.view import Images, Limits, Vector, View
 
 # How often a sample whose scene shows nothing useful may ask for another scene.
 SCENE_TRIES = 16
@@ -45,7 +47,9 @@ class DataSpec:
     `frame` that of the view it is cut from, in pixels; `radius` None draws one for each view.
     Effects that see more than places and normals have light, lens, motions and materials drawn for
     each view, up to `max_blur`, `max_motion` and `max_scatter` pixels (`view.Limits`), with
-    pictures from the folder `textures` among their textures.
+    pictures from the folder `textures` among their textures. Effects under an environment get, for
+    each view, a map of the folder `environments` or one of `skies` generated ones, and a rotation.
+    `layers` (`references.layer_of`) come beside the references.
     """
 
     scenes: tuple[str, ...]
@@ -62,9 +66,13 @@ class DataSpec:
     max_motion: float = Limits.max_motion
     max_scatter: float = Limits.max_scatter
     textures: str | None = None
+    environments: str | None = None
+    skies: int = 64
+    layers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         least = {"views": 1, "size": 1, "frame": self.size, "spp": 1, "seed": 0, "shard_size": 1}
+        least["skies"] = 0
         for key, low in least.items():
             value = getattr(self, key)
             if value < low:
@@ -78,6 +86,12 @@ class DataSpec:
         if not self.effects:
             raise ConfigError("effects", detail="no effects were given: --effects ao, say")
         require(self.effects)
+        for name in self.layers:
+            layer_of(name)
+        if self.environments is not None:
+            map_files(self.environments)
+        elif self.surrounded and not self.skies:
+            raise ConfigError("environments", detail="give --environments, or some --skies")
         if not self.scenes:
             raise ConfigError("scenes", detail="no scenes were given: --scenes procedural, say")
 
@@ -98,12 +112,23 @@ class DataSpec:
             return None
         return Limits(self.max_blur, self.max_motion, self.max_scatter, self.textures)
 
+    @property
+    def surrounded(self) -> bool:
+        """Whether an effect needs an environment."""
+        return any("environment" in EFFECTS[effect].settings for effect in self.effects)
+
     def settings(self) -> dict[str, Any]:
         """JSON-ready settings, for the manifest; those that nothing depends on are left out."""
         found = {**asdict(self), "scenes": list(self.scenes), "effects": list(self.effects)}
         if self.limits is None:
             for key in asdict(Limits()):
                 del found[key]
+        if not self.surrounded:
+            del found["environments"], found["skies"]
+        if self.layers:
+            found["layers"] = list(self.layers)
+        else:
+            del found["layers"]
         return found
 
 
@@ -147,6 +172,15 @@ def make_sample(
     The sample's own random stream picks scene, view, radius and noise, so it doesn't matter
     which worker renders it, or when. `displacements` move the scene's objects (`view.View`).
     """
+    images, record, _ = _rendered(spec, index, displacements)
+    return images, record
+
+
+def _rendered(
+    spec: DataSpec, index: int, displacements: Mapping[str, Vector] | None = None
+) -> tuple[Images, dict[str, Any], View]:
+    from deepshade_workers.environments import EnvironmentLight
+    from deepshade_workers.maps import draw_map
     from deepshade_workers.records import record_of
     from deepshade_workers.render import render_sample
     from deepshade_workers.scenes.loading import open_scene
@@ -175,20 +209,32 @@ def make_sample(
                 raise
             # One bare scene shall not end a long job: another takes its place.
             choice = spec.scenes[int(rng.integers(len(spec.scenes)))]
+    if spec.surrounded:
+        drawn = draw_map(rng.spawn(1)[0], spec.environments, spec.skies, spec.seed)
+        view = replace(view, surroundings=EnvironmentLight.of(*drawn))
     noise = int(rng.integers(2**63))
     images = render_sample(
-        scene, view, spec.size, spec.size, effects=spec.effects, samples=spec.spp, seed=noise
+        scene,
+        view,
+        spec.size,
+        spec.size,
+        effects=spec.effects,
+        layers=spec.layers,
+        samples=spec.spp,
+        seed=noise,
     )
     record = {"scene": name, "seed": noise, **record_of(view)}
-    return images, record
+    return images, record, view
 
 
 def make_shard(spec: DataSpec, index: int, folder: Path, tick: Callable[[], object]) -> Shard:
-    """Render and write shard `index`; calls `tick` after each sample."""
-    tensors = schema(spec.effects, spec.size)
+    """Render and write shard `index`, its environment maps first; `tick` after each sample."""
+    tensors = schema(spec.effects, spec.size, spec.layers)
     images, records = [], []
     for number in spec.samples(index):
-        sample, record = make_sample(spec, number)
+        sample, record, view = _rendered(spec, number)
+        if view.surroundings is not None:
+            store(folder, view.surroundings.environment)
         images.append({name: sample[name] for name in tensors})
         records.append(record)
         tick()
@@ -238,7 +284,7 @@ def generate(
     folder = folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     manifest = open_manifest(spec, folder)
-    for leftover in folder.glob(".*.tmp"):  # of a job killed while it wrote
+    for leftover in (*folder.glob(".*.tmp"), *folder.glob("*/.*.tmp")):  # of a killed job
         leftover.unlink(missing_ok=True)
     missing = [k for k in range(spec.shards) if not _complete(spec, k, manifest, folder)]
     counted = ready = spec.views - sum(len(spec.samples(k)) for k in missing)
@@ -278,6 +324,11 @@ def _complete(spec: DataSpec, index: int, manifest: Manifest, folder: Path) -> b
         and len(shard.samples) == len(spec.samples(index))
         and (folder / shard.file).is_file()
         and sha256(folder / shard.file) == shard.sha256
+        and all(
+            stored_path(folder, record["environment_sha256"]).is_file()
+            for record in shard.samples
+            if "environment_sha256" in record
+        )
         for shard in manifest.shards
     )
 

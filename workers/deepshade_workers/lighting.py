@@ -61,8 +61,21 @@ class Phong:
 
     def shine(self, local: Any) -> Any:
         """The specular part of f for light from `local`."""
-        lobe = dr.power(dr.maximum(dr.dot(local, self.mirrored), 1e-6), self.gloss)
-        return self.specular * (self.gloss + 2) * dr.inv_two_pi * lobe
+        return self.specular * (self.gloss + 2) * dr.inv_two_pi * self._lobe(local)
+
+    def sample_shine(self, pair: Any) -> Any:
+        """A local direction by the density (n + 1)/(2π) cosⁿα, for uniform `pair` in [0, 1)²."""
+        cosine = dr.power(dr.maximum(1 - pair.x, 1e-7), 1 / (self.gloss + 1))
+        sine = dr.safe_sqrt(1 - dr.square(cosine))
+        side, front = dr.sincos(dr.two_pi * pair.y)
+        return mi.Frame3f(self.mirrored).to_world(mi.Vector3f(sine * front, sine * side, cosine))
+
+    def shine_density(self, local: Any) -> Any:
+        """The density of `sample_shine` at `local`, per steradian."""
+        return (self.gloss + 1) * dr.inv_two_pi * self._lobe(local)
+
+    def _lobe(self, local: Any) -> Any:
+        return dr.power(dr.maximum(dr.dot(local, self.mirrored), 1e-6), self.gloss)
 
 
 @dataclass(frozen=True)
@@ -188,7 +201,9 @@ def direct_light(
         index += 1
     seen = sky(scene, view, -hits.surface.wi)  # where a ray hits nothing its wi is in the world
     light = dr.select(hits.valid, whole / (2 * cells), seen)
-    return hits.planar(light), hits.planar(part / (2 * cells))
+    part /= 2 * cells
+    dr.eval(light, part)  # in one kernel: else every ray would be traced twice
+    return hits.planar(light), hits.planar(part)
 
 
 def toward_camera(hits: Hits) -> Any:

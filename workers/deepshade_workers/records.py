@@ -4,18 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deepshade.camera import Camera
+from deepshade.environments.stored import read_stored
+from deepshade_workers.environments import EnvironmentLight
 from deepshade_workers.look import Look
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.view import Light, LookRecord, Vector, View
 
 
 def record_of(view: View) -> dict[str, Any]:
-    """The view's settings and camera, and its displacements, light and look where it has some."""
+    """The view's settings and camera, and what else it has.
+
+    Displacements, light and look; of an environment its name, `rotate` in degrees and
+    `environment_sha256`, by which `deepshade.environments.stored` finds it beside a data set.
+    """
     camera = view.camera
     record: dict[str, Any] = {
         **view.settings(),
@@ -33,6 +40,9 @@ def record_of(view: View) -> dict[str, Any]:
             name: value if isinstance(value, float) else list(value)
             for name, value in asdict(view.light).items()
         }
+    if view.surroundings is not None:
+        record["rotate"] = view.surroundings.rotation
+        record["environment_sha256"] = view.surroundings.environment.sha256
     if view.look is not None:
         look = view.look.record
         scatter = {name: list(path) for name, path in look.scatter.items()}
@@ -40,8 +50,14 @@ def record_of(view: View) -> dict[str, Any]:
     return record
 
 
-def view_of(record: Mapping[str, Any], scene: Scene) -> View:
-    """The view of `scene` that `record_of` made `record` of."""
+def view_of(record: Mapping[str, Any], scene: Scene, folder: Path | None = None) -> View:
+    """The view of `scene` that `record_of` made `record` of.
+
+    Its environment is that of the data set in `folder`; without one, none.
+
+    Raises:
+        DataError: the environment isn't there.
+    """
     seen: dict[str, Any] = record["camera"]
     (width, height), (x0, y0) = seen["frame"], seen["origin"]
     camera = Camera(seen["fov"], width, height, np.array(seen["world_to_camera"]), x0, y0)
@@ -53,16 +69,20 @@ def view_of(record: Mapping[str, Any], scene: Scene) -> View:
     if look is not None:
         scatter = {name: _vector(path) for name, path in look["scatter"].items()}
         look = Look.draw(scene, camera, LookRecord(**{**look, "scatter": scatter}))
+    surroundings = None
+    if folder is not None and "environment" in record:
+        found = read_stored(folder, record["environment_sha256"], record["environment"])
+        surroundings = EnvironmentLight.of(found, record["rotate"])
     return View(
         camera,
         record["radius"],
         focus=record.get("focus"),
         aperture=record.get("aperture"),
         shutter=record.get("shutter"),
-        environment=record.get("environment"),
         displacements={k: _vector(v) for k, v in record.get("displacements", {}).items()},
         light=light,
         look=look,
+        surroundings=surroundings,
     )
 
 

@@ -17,6 +17,10 @@ from deepshade_workers.backend import mitsuba
 
 mi = mitsuba()
 
+# Of samples: more make an error more certain, fewer have more strata.
+GROUPS = 16
+_BELOW_1 = 1 - 2.0**-24  # the largest float32 that is
+
 
 def random_pair(stream: Any, index: Any) -> Any:
     """Two floats in [0, 1) for sample `index` of each pixel's `stream`."""
@@ -35,6 +39,16 @@ def pixel_streams(count: int, seed: int) -> Any:
     index = dr.arange(mi.UInt32, count)
     key, _ = mi.sample_tea_32(index ^ dr.opaque(mi.UInt32, high), dr.opaque(mi.UInt32, low), 6)
     return key
+
+
+def split(number: Any, share: Any) -> tuple[Any, Any]:
+    """Whether uniform `number` in [0, 1) is below `share`, and what is left of it, uniform again.
+
+    A choice made so keeps the strata of the number within each case.
+    """
+    chosen = number < share
+    rest = dr.select(chosen, number / share, (number - share) / (1 - share))
+    return chosen, dr.clip(rest, 0, _BELOW_1)
 
 
 def strata(samples: int) -> tuple[int, int]:
@@ -59,9 +73,15 @@ def rays_used(samples: int) -> int:
 
 @dr.syntax
 def stratified_mean(
-    sample: Callable[[Any, Any, Any], Any], pixels: int, samples: int, seed: int
+    sample: Callable[[Any, Any, Any], Any],
+    pixels: int,
+    samples: int,
+    seed: int,
+    channels: int | None = None,
 ) -> tuple[Any, Any]:
     """Mean and standard error (Color3f each) of `sample(point, first, second)` for each pixel.
+
+    With `channels`, ArrayXf of that many.
 
     The three are pairs in [0, 1)²: `point` has two jittered samples in each stratum of the square,
     about `samples` in all (`rays_used`), and the others are free. Each pair's difference gives an
@@ -74,10 +94,11 @@ def stratified_mean(
     count = dr.opaque(mi.UInt32, total)
     size = mi.Point2f(mi.Float(wide), mi.Float(dr.opaque(mi.UInt32, rows)))
 
+    none = mi.Color3f(0) if channels is None else dr.zeros(mi.ArrayXf, (channels, pixels))
     index = mi.UInt32(0)
-    mean = mi.Color3f(0)
-    squares = mi.Color3f(0)
-    before = mi.Color3f(0)
+    mean = type(none)(none)
+    squares = type(none)(none)
+    before = type(none)(none)
     while index < count:
         cell = index // 2
         corner = mi.Point2f(mi.Float(cell % wide), mi.Float(cell // wide))
@@ -90,4 +111,47 @@ def stratified_mean(
         squares += difference * difference
         before = value
         index += 1
-    return mean / total, dr.sqrt(squares) / total
+    found = mean / total, dr.sqrt(squares) / total
+    dr.eval(found)  # in one kernel: one after the other they would trace every ray twice
+    return found
+
+
+@dr.syntax
+def hypercube_mean(
+    sample: Callable[[Any, Any, Any], Any], pixels: int, samples: int, seed: int
+) -> tuple[Any, Any]:
+    """`stratified_mean` where all three pairs matter: each has its own strata.
+
+    Samples come in `GROUPS` groups. Within one, the strata of each pair are taken once, in an order
+    of its own (Latin hypercube sampling: McKay, Beckman and Conover, Technometrics 21, 1979). The
+    groups are independent, so that their spread gives an unbiased variance of the mean.
+    """
+    columns, rows = strata(2 * max(1, samples // GROUPS))
+    cells = columns * rows
+    stream = pixel_streams(pixels, seed)
+    wide = dr.opaque(mi.UInt32, columns)
+    size = mi.Point2f(mi.Float(wide), mi.Float(dr.opaque(mi.UInt32, rows)))
+    each = dr.opaque(mi.UInt32, cells)
+    count = dr.opaque(mi.UInt32, GROUPS * cells)
+
+    def pair(index: Any, which: int) -> Any:
+        order, _ = mi.sample_tea_32(stream, ~(3 * (index // each) + which), 6)
+        cell = mi.permute_kensler(index % each, cells, order)
+        corner = mi.Point2f(mi.Float(cell % wide), mi.Float(cell // wide))
+        return (corner + random_pair(stream, 3 * index + which)) / size
+
+    index = mi.UInt32(0)
+    group = mi.Color3f(0)
+    mean = mi.Color3f(0)
+    squares = mi.Color3f(0)  # of the groups' deviations from their mean (Welford, 1962)
+    while index < count:
+        group += sample(pair(index, 0), pair(index, 1), pair(index, 2)) / mi.Float(each)
+        index += 1
+        complete = index % each == 0
+        deviation = dr.select(complete, group - mean, 0)
+        mean += deviation / mi.Float(dr.maximum(index // each, 1))
+        squares += deviation * dr.select(complete, group - mean, 0)
+        group = dr.select(complete, 0, group)
+    error = dr.sqrt(squares / (GROUPS * (GROUPS - 1)))
+    dr.eval(mean, error)  # in one kernel
+    return mean, error

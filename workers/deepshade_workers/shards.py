@@ -14,11 +14,14 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.files import replacing
 from deepshade.manifest import Shard
+from deepshade_workers.references import layer_of
 from deepshade_workers.view import Images
 
 
-def schema(effects: Sequence[str], size: int) -> dict[str, dict[str, Any]]:
-    """Tensors of a data set for `effects`: their inputs, references and errors."""
+def schema(
+    effects: Sequence[str], size: int, layers: Sequence[str] = ()
+) -> dict[str, dict[str, Any]]:
+    """Tensors of a data set for `effects`: their inputs, references, errors, and more `layers`."""
     tensors: dict[str, dict[str, Any]] = {}
     for row in (EFFECTS[effect] for effect in effects):
         for attribute in (ATTRIBUTES[name] for name in row.inputs):
@@ -26,6 +29,10 @@ def schema(effects: Sequence[str], size: int) -> dict[str, dict[str, Any]]:
             tensors[attribute.name] = {"dtype": attribute.unit.storage, "shape": shape}
         for name in (f"reference_{row.name}", f"reference_{row.name}_error"):
             tensors[name] = {"dtype": row.storage, "shape": [len(row.outputs), size, size]}
+    for layer in layers:
+        channels, _ = layer_of(layer)
+        for name in (f"reference_{layer}", f"reference_{layer}_error"):
+            tensors[name] = {"dtype": "float16", "shape": [channels, size, size]}
     return tensors
 
 

@@ -13,6 +13,7 @@ from deepshade.camera import Camera
 from deepshade.effects import SETTINGS
 
 if TYPE_CHECKING:
+    from deepshade_workers.environments import EnvironmentLight
     from deepshade_workers.look import Look
 
 Vector = tuple[float, float, float]
@@ -72,11 +73,12 @@ class LookRecord:
 class View:
     """A camera with the settings of what is seen through it; None where they aren't set.
 
-    `radius`, `focus` (distance) and `aperture` (diameter) are in scene units, `shutter` in frames,
-    `environment` is a map's name. `displacements` says by name how far objects of the scene move
+    `radius`, `focus` (distance) and `aperture` (diameter) are in scene units, `shutter` in frames.
+    `displacements` says by name how far objects of the scene move
     while the shutter is open, (x, y, z) in world space; the picture is of the middle of that time.
     Without a `light` the scene's own lights, or its default ones, count; without a `look` its own
-    materials.
+    materials. `surroundings` are the environment of effects that have one, which no other light
+    comes from.
     """
 
     camera: Camera
@@ -84,10 +86,15 @@ class View:
     focus: float | None = None
     aperture: float | None = None
     shutter: float | None = None
-    environment: str | None = None
     displacements: Mapping[str, Vector] = field(default_factory=dict)
     light: Light | None = None
     look: Look | None = field(default=None, compare=False)
+    surroundings: EnvironmentLight | None = field(default=None, compare=False)
+
+    @property
+    def environment(self) -> str | None:
+        """The name of the environment map."""
+        return None if self.surroundings is None else self.surroundings.environment.name
 
     def settings(self) -> dict[str, float | str]:
         """The settings that are set, by their names in `deepshade.effects.SETTINGS`."""
@@ -95,5 +102,8 @@ class View:
 
     def header(self) -> dict[str, Any]:
         """The EXR attributes of the camera and the settings."""
-        settings = {SETTINGS[name].header: value for name, value in self.settings().items()}
-        return {**self.camera.to_header(), **settings}
+        header = {SETTINGS[name].header: value for name, value in self.settings().items()}
+        if self.surroundings is not None:
+            header["deepshade:rotate"] = self.surroundings.rotation
+            header["deepshade:environment_sha256"] = self.surroundings.environment.sha256
+        return {**self.camera.to_header(), **header}

@@ -36,7 +36,10 @@ class Grid:
 
     def pixels(self) -> tuple[Any, Any]:
         """Column and row of every pixel."""
-        index = dr.arange(mi.Int32, self.shape[0] * self.shape[1])
+        return self.coordinates(dr.arange(mi.Int32, self.shape[0] * self.shape[1]))
+
+    def coordinates(self, index: Any) -> tuple[Any, Any]:
+        """Column and row of pixels by their index."""
         row = index // self.width
         return index - row * self.width, row
 
@@ -63,7 +66,16 @@ def light(planes: Float) -> Any:
 
 def plain(plane: Float) -> Any:
     """(H, W) on the device; what isn't finite is 0."""
-    return mi.Float(np.nan_to_num(plane, posinf=0.0, neginf=0.0).astype(np.float32).ravel())
+    values = mi.Float(np.nan_to_num(plane, posinf=0.0, neginf=0.0).astype(np.float32).ravel())
+    # A copy: NumPy's own memory may not be aligned, and then kernels differ from view to view.
+    values = values * dr.opaque(mi.Float, 1)
+    dr.eval(values)
+    return values
+
+
+def number(value: float) -> Any:
+    """A number on the device: no constant of what is compiled with it."""
+    return dr.opaque(mi.Float, value)
 
 
 def gradient_noise(column: Any, row: Any) -> Any:
@@ -80,7 +92,9 @@ class Filter:
     """A screen-space Method: `upload` puts a view on the device, `kernel` shades it.
 
     The kernel is given what was uploaded, the settings' values and the parameters', and returns
-    a plane, or the picture's colour, on the device.
+    a plane, or the picture's colour, on the device. A `recorded` kernel is traced once a view: for
+    every frame that takes Python longer than many a frame does. It may make no arrays from numbers
+    of Python.
     """
 
     family = "screen-space"
@@ -92,7 +106,11 @@ class Filter:
         parameters: Any,
         upload: Callable[[View], Any],
         kernel: Callable[..., Any],
+        *,
+        recorded: bool = False,
     ) -> None:
+        if recorded:
+            kernel = dr.freeze(kernel, limit=4, warn_after=1 << 30)
         self.name, self.settings, self.parameters = name, settings, parameters
         self._upload, self._kernel = upload, kernel
         self._frame: Any = None

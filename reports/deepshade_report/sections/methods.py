@@ -61,6 +61,7 @@ def error(context: Context) -> dict[str, Any]:
         "size": [views[0].width, views[0].height],
         "trivial_dssim": significant(trivial),
         "trivial_standard_error": standard_error(nothing),
+        "floor": mean_of([value for view in views if (value := view.floor()) is not None]),
         "trivial_relative": mean_of([v.relative(v.trivial()) for v in views if v.effect.is_light]),
         "rows": rows,
         "missing": missing,

@@ -7,7 +7,8 @@ PRESETS = {
         "network": {
             "kind": "carrier",
             "bases": "neighbours",
-            "widths": (24, 48),
+            "fold": 2,
+            "widths": (16, 32),
             "steps": (4,),
             "down": (1, 2),
             "up": (1,),

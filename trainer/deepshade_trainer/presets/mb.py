@@ -3,6 +3,14 @@
 from deepshade_trainer.presets.paper import PAPER
 
 PRESETS = {
-    "balanced": {"network": {"kind": "carrier", "bases": "lines", "widths": (32, 64, 96)}},
+    "balanced": {
+        "network": {
+            "kind": "carrier",
+            "bases": "lines",
+            "widths": (32, 48, 64),
+            "steps": (2, 2),
+            "up": (1, 1),
+        }
+    },
     "paper": {**PAPER, "network": {"kind": "paper", "u0": 16, "levels": 5}},
 }

@@ -6,6 +6,10 @@
 settings, `hits` (`trace.Hits`) what each pixel's centre sees, and `images` the attributes that
 were made of them, at least the effect's inputs. `samples` are per pixel; the same `seed` gives the
 same noise. Both results are planar (C, H, W) float32 with the effect's outputs as channels.
+
+A file may also define `LAYERS`: what networks may learn from beside the reference, made on request.
+Each is a function like `reference` by its name, with the number of its channels; the whole is asked
+for as `<effect>_<name>`.
 """
 
 from __future__ import annotations
@@ -33,6 +37,21 @@ def require(effects: Iterable[str]) -> None:
             raise ConfigError(
                 effect, there, detail=f"no reference for {effect!r}; there are: {', '.join(there)}"
             )
+
+
+def layers_of(effect: str) -> dict[str, tuple[int, Reference]]:
+    """What may be asked for beside the reference of `effect`: (channels, function) by full name."""
+    module = import_module(f"{__name__}.{effect}")
+    found: dict[str, tuple[int, Reference]] = getattr(module, "LAYERS", {})
+    return {f"{effect}_{name}": layer for name, layer in found.items()}
+
+
+def layer_of(name: str) -> tuple[int, Reference]:
+    """Channels and function of the layer `name`; ConfigError if no effect has it."""
+    there = {full: layer for effect in known() for full, layer in layers_of(effect).items()}
+    if name not in there:
+        raise ConfigError(name, there, detail=f"no layer {name!r}; there are: {', '.join(there)}")
+    return there[name]
 
 
 def reference_of(effect: str) -> Reference:

@@ -60,4 +60,5 @@ def reference(
     error = dr.sqrt(mi.Float(differing)) / (2 * cells)
     visibility = dr.select(hits.valid, visibility, 1)
     error = dr.select(hits.valid, error, 0)
+    dr.eval(visibility, error)  # in one kernel: else every ray would be traced twice
     return hits.planar(visibility), hits.planar(error)

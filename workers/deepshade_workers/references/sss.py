@@ -186,6 +186,7 @@ def _diffuse(
     # The variance of a ratio of sums, to the first order.
     variance = light_square - 2 * value * cross + dr.square(value) * square
     error = dr.sqrt(dr.maximum(variance, 0)) / (used * weight)
+    dr.eval(value, error)  # in one kernel
     return hits.planar(value), hits.planar(error)
 
 

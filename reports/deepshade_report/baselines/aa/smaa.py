@@ -18,7 +18,7 @@ import drjit as dr
 
 from deepshade_report.baselines.aa.areas import DIAGONAL, diagonal_areas, line_areas
 from deepshade_report.baselines.aa.seen import Lit, encoded, luma, upload
-from deepshade_report.baselines.picture import Filter, Grid, mi
+from deepshade_report.baselines.picture import Filter, Grid, mi, number
 from deepshade_report.tuning import Ranges, Tunable, tuned
 
 WEST, NORTH = 1, 2  # bits of a pixel's edges
@@ -72,20 +72,36 @@ def methods(quick: bool) -> list[Filter]:
 
 def _shade(lit: Lit, kind: str, threshold: float, steps: int, diagonal: int, *given: float) -> Any:
     factor, contrast, rounding = given
-    least = dr.opaque(mi.Float, threshold * factor)
-    if kind == "depth":
-        edges = _depth_edges(lit, least)
-    else:
-        seen = encoded(lit)
-        if kind == "luma":
-            seen = luma(seen)
-        dr.eval(seen)
-        edges = _edges(lit.grid, seen, least, dr.opaque(mi.Float, contrast))
-    dr.eval(edges)
-    shifts = Edges(lit.grid, edges)
+    edges = _detected(lit, kind, number(threshold * factor), number(contrast))
+    where = dr.compress(edges != 0)
+    if not len(where):
+        return lit.light
     counts = dr.opaque(mi.Int32, steps), dr.opaque(mi.Int32, diagonal)
-    keep = dr.opaque(mi.Float, 1 - rounding)
-    weights = _weights(shifts, diagonal_areas(), *counts, keep)
+    return _blended(lit, edges, where, diagonal_areas(), *counts, number(1 - rounding))
+
+
+# Passes are recorded once and replayed: to trace them for each frame took a fifth of the time.
+@dr.freeze
+def _detected(lit: Lit, kind: str, threshold: Any, contrast: Any) -> Any:
+    """Each pixel's edges to the left and above, WEST and NORTH."""
+    if kind == "depth":
+        return _depth_edges(lit, threshold)
+    seen = encoded(lit)
+    if kind == "luma":
+        seen = luma(seen)
+    dr.eval(seen)
+    return _edges(lit.grid, seen, threshold, contrast)
+
+
+@dr.freeze
+def _blended(
+    lit: Lit, edges: Any, where: Any, table: Any, steps: Any, diagonal: Any, keep: Any
+) -> Any:
+    """The picture, from edges and the indices of the pixels that have any."""
+    place = lit.grid.coordinates(mi.Int32(where))
+    found = _weights(Edges(lit.grid, edges), table, *place, steps, diagonal, keep)
+    weights = dr.zeros(mi.Vector4f, dr.width(edges))
+    dr.scatter(weights, found, where)
     dr.eval(weights)
     return _blend(lit, weights)
 
@@ -140,9 +156,10 @@ class Edges:
         return (dr.gather(mi.UInt32, self.bits, index, inside) & bit) != 0
 
 
-def _weights(edges: Edges, table: Any, steps: Any, diagonal: Any, keep: Any) -> Any:
+def _weights(
+    edges: Edges, table: Any, column: Any, row: Any, steps: Any, diagonal: Any, keep: Any
+) -> Any:
     """How much of the pixels across it an edge blends: NORTH's to this and above, WEST's alike."""
-    column, row = edges.grid.pixels()
     north, west = (edges.at(column, row, bit) for bit in (NORTH, WEST))
     slanted = _diagonals(edges, table, column, row, north & (diagonal > 0), west, diagonal)
     found = slanted[0] + slanted[1] > 0

@@ -72,7 +72,12 @@ def build(grid: Grid, colour: Any, radius: Any) -> Pyramid:
     joined = dr.concat(radii)
     dr.eval(row, joined)
     widths, heights = [g.shape[1] for g in grids], [g.shape[0] for g in grids]
-    return Pyramid(grids, row, joined, mi.Int32(starts), mi.Int32(widths), mi.Int32(heights))
+    return Pyramid(grids, row, joined, *(_table(each) for each in (starts, widths, heights)))
+
+
+def _table(values: list[int]) -> Any:
+    """Numbers on the device, made there: what is copied to it can't be recorded."""
+    return dr.concat([dr.opaque(mi.Int32, value) for value in values])
 
 
 def _halved(fine: Grid, coarse: Grid, colour: Any, radius: Any) -> tuple[Any, Any]:

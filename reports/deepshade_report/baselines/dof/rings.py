@@ -60,19 +60,21 @@ class Parameters:
 
 PUBLISHED = Parameters()
 RANGES: Ranges = {
-    "sharp": (0.2, 1.5),
+    "sharp": (0.0, 1.5),
     "fade": (0.2, 2.0),
     "jitter": (0.0, 1.0),
     "coarse": (-1.0, 1.0),
     "split": (0.5, 6.0),
-    "longest": (24.0, 40.0),
+    "longest": (24.0, 64.0),
 }
 
 
 def rings(count: int, half: bool, parameters: Parameters | None = None) -> Filter:
     """The gather as a Method, with the parameters that were tuned or those given."""
     parameters = parameters or Parameters(**tuned(__package__, "rings"))
-    return Filter("ring gather", {"rings": count, "half": half}, parameters, upload, _shade)
+    return Filter(
+        "ring gather", {"rings": count, "half": half}, parameters, upload, _shade, recorded=True
+    )
 
 
 TUNABLE = Tunable(partial(rings, 4, False), PUBLISHED, RANGES)

@@ -1,9 +1,5 @@
-"""What indirect light is compared with: the visibility bitmask.
+"""What indirect light is compared with: the visibility bitmask."""
 
-To tune: `python -m deepshade_report.tuning --effect gi --data DATA --out tuned.json`, on views
-apart from those that are reported; the result belongs beside this file.
-"""
-
-METHODS = {"visibility bitmask": "bitmask"}
+METHODS = {"visibility bitmask": "bitmask", "marched rays": "onelayer"}
 # Nalbach et al. 2017, table 1: milliseconds at 768 x 512 on a GTX 980 Ti, SSIM on its own test set
 PUBLISHED = (60.0, 0.798)

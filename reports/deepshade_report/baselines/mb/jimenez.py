@@ -51,14 +51,14 @@ RANGES: Ranges = {
     "jitter": (0.0, 1.0),
     "wander": (0.0, 0.5),
     "own": (0.0, 1.2),
-    "tile": (32, 64),
+    "tile": (16, 64),
 }
 
 
 def jimenez(pairs: int, parameters: Parameters | None = None) -> Filter:
     """The filter as a Method, with the parameters that were tuned or those given."""
     parameters = parameters or Parameters(**tuned(__package__, "jimenez"))
-    return Filter("Jimenez", {"pairs": pairs}, parameters, upload, _shade)
+    return Filter("Jimenez", {"pairs": pairs}, parameters, upload, _shade, recorded=True)
 
 
 TUNABLE = Tunable(partial(jimenez, 8), PUBLISHED, RANGES)

@@ -43,14 +43,14 @@ RANGES: Ranges = {
     "extent": (0.002, 0.2),
     "centre": (0.1, 4.0),
     "jitter": (0.0, 1.0),
-    "tile": (32, 64),
+    "tile": (16, 64),
 }
 
 
 def mcguire(taps: int, parameters: Parameters | None = None) -> Filter:
     """The filter as a Method, with the parameters that were tuned or those given."""
     parameters = parameters or Parameters(**tuned(__package__, "mcguire"))
-    return Filter("McGuire", {"taps": taps}, parameters, upload, _shade)
+    return Filter("McGuire", {"taps": taps}, parameters, upload, _shade, recorded=True)
 
 
 TUNABLE = Tunable(partial(mcguire, 15), PUBLISHED, RANGES)

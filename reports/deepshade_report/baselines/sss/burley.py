@@ -49,7 +49,7 @@ PUBLISHED = Parameters()
 RANGES: Ranges = {
     "width": (0.7, 1.4),
     "small": (0.25, 4.0),
-    "blur": (0, 2),
+    "blur": (0, 6),
     "edge": (0.02, 0.5),
 }
 

@@ -1,8 +1,9 @@
 """Indirect light: what the surfaces in the picture send, gathered along rays over the picture.
 
-Around each cell of 8 x 8 pixels points are looked at in eight directions, at distances that grow
-geometrically. The sector that a point newly raises above the horizon so far it fills with its light
-(B. Mayaux, *Horizon-Based Indirect Lighting*, 2018; slices through the view as in J. Jimenez,
+Around each cell of 4 x 4 pixels points are looked at in six directions, at distances that grow
+geometrically; four neighbours take turns at both, so that the smoothing after it, along surfaces,
+sees 24 directions. The sector that a point newly raises above the horizon so far it fills with its
+light (B. Mayaux, *Horizon-Based Indirect Lighting*, 2018; slices through the view as in J. Jimenez,
 X. Wu, A. Pesce and A. Jarabo, *Practical Real-Time Strategies for Accurate Indirect Occlusion*,
 2016). A sector's ∫ ω dω has a closed form, so that a cell carries each colour's vector irradiance
 (J. Arvo, *The Irradiance Jacobian for Partially Occluded Polyhedral Sources*, 1994), and every
@@ -28,23 +29,21 @@ from deepshade_trainer.networks.bases.base import Bases, State
 from deepshade_trainer.networks.horizons import covered, sampled, unit
 from deepshade_trainer.networks.receptive_field import Span, folded, grown
 
-CELL = 8
+CELL = 4
+# Cells take turns, 2 x 2 of them: each has other directions and distances.
+TURNS = 2
+_PHASES = TURNS * TURNS
+RAYS = 6  # from each cell
 # How many cells away the points of a ray lie, and how many cells wide the square is whose mean
-# light each of them sends.
-RINGS = (1, 2, 3, 5, 8, 12, 17, 24, 35)
-SPREADS = (1, 1, 1, 1, 3, 3, 5, 9, 9)
-_DIAGONAL = math.sqrt(0.5)
-# Rays in the picture: right and up.
-RAYS = (
-    (1.0, 0.0),
-    (_DIAGONAL, _DIAGONAL),
-    (0.0, 1.0),
-    (-_DIAGONAL, _DIAGONAL),
-    (-1.0, 0.0),
-    (-_DIAGONAL, -_DIAGONAL),
-    (0.0, -1.0),
-    (_DIAGONAL, -_DIAGONAL),
-)
+# light each of them sends. By turns they are nearer and farther, by up to a sixth.
+RINGS = (2, 4, 6, 10, 16, 24, 34, 48, 70)
+SPREADS = (1, 1, 1, 3, 5, 5, 9, 17, 17)
+_FARTHER = (0.86, 1.05, 1.16, 0.95)
+_ANGLES = [
+    [2 * math.pi * (ray + turn / _PHASES) / RAYS for turn in (0, 2, 3, 1)] for ray in range(RAYS)
+]
+# Right and up in the picture, for each ray and turn.
+DIRECTIONS = [[(math.cos(angle), math.sin(angle)) for angle in turns] for turns in _ANGLES]
 _TOLD, _HIDDEN = 4, 32  # of each point; of a ray's network
 _MOST = 3.0  # of the logarithm of a gain
 _CAUTION = 0.1  # of the trunk's weights, so that it begins near the horizons' answer
@@ -57,6 +56,12 @@ _STEP = 0.25
 _GONE, _FADE = 1.7, 4.0
 # ∫ √(1 - c²) dc, an odd polynomial in c to 0.002.
 _ARC = (0.9943, -0.1293, -0.0776)
+# Neighbours count less by this much times the squared sine of how far off the tangent plane they
+# lie.
+_BENT = 4.0
+# How far apart two angles' cosines may be, for the sine of what lies between them.
+_CHORD = 1.2
+_PLACES = [(ray, phase) for ray in range(RAYS) for phase in range(_PHASES)]
 
 
 class Bounces(Bases):
@@ -69,7 +74,7 @@ class Bounces(Bases):
 
     told = 6  # normal and position as they are: a geometric trunk tells itself the horizons
     weights = 6
-    size_multiple = CELL
+    size_multiple = CELL * TURNS
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,12 +91,9 @@ class Bounces(Bases):
         pooled = F.avg_pool2d(torch.cat([light * surface, surface], 1), CELL)  # (N, 4, h, w)
         six = torch.cat([normal, position], 1)
         cells = sampled(six, CELL)
-        carried = self._gathered(unit(cells[:, :3]), cells[:, 3:], _spread(pooled))
-        # A cell whose one point shows nothing takes what those around it have.
-        valid = covered(cells[:, 5:])
-        around = F.avg_pool2d(torch.cat([carried * valid, valid], 1), 3, 1, 1)
-        filled = around[:, :-1] / around[:, -1:].clamp_min(1e-3)
-        return six, (unit(normal), carried * valid + filled * (1 - valid))
+        directions, places = unit(cells[:, :3]), cells[:, 3:]
+        carried = self._gathered(directions, places, _spread(pooled))
+        return six, (unit(normal), _smoothed(carried, directions, places))
 
     def _gathered(self, normal: Tensor, position: Tensor, lights: Sequence[Tensor]) -> Tensor:
         """What cells receive (N, 15, h, w) of the light of others (N, 3, h, w), at each ring.
@@ -99,26 +101,37 @@ class Bounces(Bases):
         Of each colour: the vector irradiance's x, y and z over π, the light of all its sectors
         over 2 π, and the mean light within the radius.
         """
-        size = (len(position), -1, len(RAYS), *position.shape[2:])
+        count, _, height, width = position.shape
+        height, width = height // TURNS, width // TURNS
+        size = (count, -1, RAYS, _PHASES, height * width)
         across, depth = torch.split(position, [2, 1], 1)
         # Nothing is near what is far behind the camera: neither background nor what isn't there.
         here = torch.cat([across, depth + (covered(depth) * -_AWAY + _AWAY)], 1)
-        view = unit(position * -1)  # to the eye
-        along = torch.tensor(RAYS, dtype=normal.dtype).T.reshape(2, len(RAYS), 1, 1)
-        along = along.to(normal.device)
+        surface = torch.cat([here, normal], 1)
+        here, normal = torch.split(_by_turns(surface), 3, 1)  # (N, 3, turns h, w)
+        view = unit(_by_turns(position) * -1)  # to the eye
+        along = torch.tensor(DIRECTIONS, dtype=normal.dtype, device=normal.device)
+        along = along.permute(2, 0, 1).reshape(1, 2, RAYS, _PHASES, 1)
+
+        def lengthwise(vectors: Tensor) -> Tensor:
+            """How far vectors (N, 3, turns h, w) go along each ray: (N, 1, rays turns h, w)."""
+            flat = vectors[:, :2].reshape(count, 2, 1, _PHASES, height * width)
+            return (flat * along).sum(1).reshape(count, 1, -1, width)
+
         # The ray's direction square to the view is (along - view · slant) · upright.
-        slant = (view[:, :2, None] * along).sum(1)  # (N, rays, h, w)
+        slant = lengthwise(view)
         upright = torch.rsqrt((1 - slant * slant).clamp_min(1e-3))
-        facing = (normal * view).sum(1, keepdim=True).clamp_min(0.02)
-        leaning = ((normal[:, :2, None] * along).sum(1) - facing * slant) * upright
+        facing = _repeated((normal * view).sum(1, keepdim=True).clamp_min(0.02))
+        leaning = (lengthwise(normal) - facing * slant) * upright
         # Cosines to the view: of the tangent plane first, of the horizon then.
-        low = leaning * -1 * torch.rsqrt(leaning * leaning + facing * facing)
-        horizon = _stacked(low.unsqueeze(1))  # (N, 1, rays h, w)
+        shortened = torch.rsqrt(leaning * leaning + facing * facing)
+        tangent = horizon = leaning * -1 * shortened
+        upward = torch.split(_repeated(normal) * (shortened * _CHORD), 1, 1)
         centre, eye = _repeated(here), torch.split(_repeated(view), 1, 1)
         told, towards, sideways, seen, close, sent = [], [], [], [], [], []
         before = horizon * 0
         for ring, light in zip(RINGS, lights, strict=True):
-            there = _moved(torch.cat([here, normal, light], 1), ring)  # (N, 9, rays h, w)
+            there = _moved(torch.cat([surface, light], 1), ring)  # (N, 9, rays turns h, w)
             points, normals, light = torch.split(there, 3, 1)
             delta = torch.split(points + centre * -1, 1, 1)
             square = _total(d * d for d in delta).clamp(1e-8, 16)
@@ -129,53 +142,63 @@ class Bounces(Bases):
             near = near * (distance * -_FADE + _GONE * _FADE).clamp(0, 1)
             before = distance
             cosine = _total(d * e for d, e in zip(delta, eye, strict=True)) * inverse
+            # Cells lie beside the ray; none may seem to rise above a tangent plane that it is on.
+            above = _total(d * t for d, t in zip(delta, upward, strict=True)) * inverse
+            cosine = torch.minimum(cosine, tangent + F.relu(above)).clamp(-1, 1)
             back = _total(d * n for d, n in zip(delta, torch.split(normals, 1, 1), strict=True))
-            rise = F.relu(cosine.clamp(-1, 1) + horizon * -1)
+            rise = F.relu(cosine + horizon * -1)
             rise = (rise + rise.clamp(max=_STEP) * 0.5) * near  # up to half-way to the next point
-            rise = torch.minimum(rise, 1 - horizon)
+            rise = torch.minimum(rise, F.relu(1 - horizon))
             turned = (back * inverse).clamp(-1, 1)  # < 0: what is seen of it faces the receiver
-            told += [rise, cosine.clamp(-1, 1) * near, turned * near, distance * 0.25]
+            told += [rise, cosine * near, turned * near, distance * 0.25]
             above = horizon + rise
             towards.append(rise * (above + horizon) * 0.5)
-            sideways.append(_arc(horizon, above) * rise)
+            sideways.append(rise * _steepness(above, horizon))
             seen.append(rise)
             close.append(near)
             sent.append(light)
             horizon = above
         gains = torch.exp(self.ray(torch.cat(told, 1)).clamp(-_MOST, _MOST))
-        sums = []
-        for parts in (towards, sideways, seen):
-            shares = torch.split(torch.cat(parts, 1) * gains, 1, 1)
-            total = _total(part * s for part, s in zip(sent, shares, strict=True))
-            sums.append(total.reshape(size))  # (N, 3, rays, h, w)
+        gained = [s * g for s, g in zip(sent, torch.split(gains, 1, 1), strict=True)]
+        sums = [
+            _total(light * part for light, part in zip(gained, parts, strict=True)).reshape(size)
+            for parts in (towards, sideways, seen)
+        ]  # (N, 3, rays, h, w)
         # the mean light of all points within the radius, be they visible from here or not
         reached = _total(part * n for part, n in zip(sent, close, strict=True)).reshape(size)
-        count = _total(close).reshape(size).sum(2)
-        around = reached.sum(2) / count.clamp_min(1)
-        share = 1 / len(RAYS)
-        side = sums[1] * (upright * (2 * share)).unsqueeze(1)
-        right, up = ((side * along[k]).sum(2) for k in (0, 1))
-        x, y, z = torch.split(view, 1, 1)
+        around = reached.sum(2) / _total(close).reshape(size).sum(2).clamp_min(1)
+        share = 1 / RAYS
+        side = (sums[1] * (upright * (2 * share)).reshape(size)).unsqueeze(1)
+        # (N, 3, turns, h w)
+        right, up = ((side * along[:, k : k + 1]).sum(3).squeeze(1) for k in (0, 1))
+        x, y, z = torch.split(view.reshape(count, 3, _PHASES, -1), 1, 1)
         depth = sums[0].sum(2) * (2 * share) - right * x - up * y
         open_ = sums[2].sum(2) * share
-        return torch.cat([right + depth * x, up + depth * y, depth * z, open_, around], 1)
+        found = torch.cat([right + depth * x, up + depth * y, depth * z, open_, around], 1)
+        return F.pixel_shuffle(found.reshape(count, -1, height, width), TURNS)
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
         normal, cells = state
-        wide = F.interpolate(cells, scale_factor=CELL, mode="bilinear", align_corners=False)
-        x, y, z, seen, around = torch.split(wide, 3, 1)
-        gain, bend, open_, hidden = torch.split(weights * _CAUTION, [1, 3, 1, 1], 1)
+        gain, bend, shares = torch.split(weights * _CAUTION, [1, 3, 2], 1)
+        open_, hidden = torch.split(F.avg_pool2d(shares, CELL), 1, 1)
+        *flow, seen, around = torch.split(cells, 3, 1)
+        x, y, z, rest = (
+            F.interpolate(part, scale_factor=CELL, mode="bilinear", align_corners=False)
+            for part in (*flow, seen * open_ + around * (hidden * _GUESS))
+        )
         i, j, k = torch.split(normal + bend, 1, 1)
-        image = x * i + y * j + z * k + seen * open_
-        return image * torch.exp(gain.clamp(-_MOST, _MOST)) + around * (hidden * _GUESS)
+        return (x * i + y * j + z * k + rest) * torch.exp(gain.clamp(-_MOST, _MOST))
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        # The two nearest cells, from which it is up-sampled, and those that fill a gap there.
+        # The two nearest cells, from which it is up-sampled, and those they are smoothed with.
         first = (pixel - CELL // 2) // CELL
         cells = grown((first, first + 1), 1)
-        reach = max(r + _reach(s) for r, s in zip(RINGS, SPREADS, strict=True))
+        reach = max(
+            _reach(spread) + max(abs(n) for place in _PLACES for n in _offset(ring, *place))
+            for ring, spread in zip(RINGS, SPREADS, strict=True)
+        )
         return folded(grown(cells, reach), CELL)
 
 
@@ -199,39 +222,73 @@ def _spread(pooled: Tensor) -> list[Tensor]:
     return [means[spread] for spread in SPREADS]
 
 
-def _arc(a: Tensor, b: Tensor) -> Tensor:
-    """The mean of √(1 - c²) over cosines c from a to b, both in [-1, 1].
+def _steepness(a: Tensor, b: Tensor) -> Tensor:
+    """∫ √(1 - c²) dc from b to a over (a - b), for cosines in [-1, 1].
 
-    Times b - a it is the integral, and exactly 0 where that is: engines round the difference of
-    two integrals to something else, which any light from beyond the radius would be seen by.
+    A difference of two integrals wouldn't be exactly 0 where nothing rises, and light is large.
     """
-    first, second, both = a * a, b * b, a * b
-    three = first + second + both
-    five = first * first + second * second + both * three
-    return five * _ARC[2] + three * _ARC[1] + _ARC[0]
+    product = a * b
+    square = a * a + b * b
+    both = square + product
+    return (square * both + product * product * -1) * _ARC[2] + both * _ARC[1] + _ARC[0]
 
 
 def _total(parts: Iterable[Tensor]) -> Tensor:
     return reduce(add, parts)
 
 
-def _stacked(x: Tensor) -> Tensor:
-    """(N, C, rays, h, w) to (N, C, rays h, w): engines like four axes."""
-    count, channels, rays, height, width = x.shape
-    return x.reshape(count, channels, rays * height, width)
+def _by_turns(x: Tensor) -> Tensor:
+    """(N, C, 2 h, 2 w) to (N, C, turns h, w): cells that have the same turn together."""
+    count, channels, _, width = x.shape
+    return F.pixel_unshuffle(x, TURNS).reshape(count, channels, -1, width // TURNS)
 
 
 def _repeated(x: Tensor) -> Tensor:
-    """(N, C, h, w) to (N, C, rays h, w): the same for each ray."""
-    return torch.cat([x] * len(RAYS), 2)
+    """(N, C, turns h, w) to (N, C, rays turns h, w): the same for each ray."""
+    return torch.cat([x] * RAYS, 2)
+
+
+def _offset(ring: int, ray: int, phase: int) -> tuple[int, int]:
+    """Columns right and rows down, in cells, to a point of a ray."""
+    right, up = DIRECTIONS[ray][phase]
+    far = ring * _FARTHER[(phase + ray) % _PHASES]
+    return round(right * far), round(-up * far)
 
 
 def _moved(x: Tensor, ring: int) -> Tensor:
-    """(N, C, h, w) to (N, C, rays h, w): what lies `ring` cells away; beyond the edge _AWAY."""
-    wide = F.pad(x, (ring, ring, ring, ring), value=_AWAY)
+    """(N, C, 2 h, 2 w) to (N, C, rays turns h, w): a ring's points; beyond the edge _AWAY."""
+    margin = max(abs(n) for k in _PLACES for n in _offset(ring, *k)) // TURNS + 1
+    wide = F.pad(F.pixel_unshuffle(x, TURNS), (margin,) * 4, value=_AWAY)
+    count, channels, height, width = wide.shape
+    turns = wide.reshape(count, channels // _PHASES, _PHASES, height, width).unbind(2)
     moved = []
-    for right, up in RAYS:
-        columns, rows = round(right * ring), round(-up * ring)
-        cut = (-ring - columns, columns - ring, -ring - rows, rows - ring)
-        moved.append(F.pad(wide, cut))
+    for ray, phase in _PLACES:
+        right, down = _offset(ring, ray, phase)
+        rows, row = divmod(phase // TURNS + down, TURNS)
+        columns, column = divmod(phase % TURNS + right, TURNS)
+        cut = (-margin - columns, columns - margin, -margin - rows, rows - margin)
+        moved.append(F.pad(turns[row * TURNS + column], cut))
     return torch.cat(moved, 2)
+
+
+def _smoothed(carried: Tensor, normal: Tensor, position: Tensor) -> Tensor:
+    """What cells carry (N, C, h, w), the mean over 3 x 3, so over all turns, of one surface.
+
+    `normal` and `position` (N, 3, h, w) are zero where a cell's point shows nothing: such a cell
+    takes what those around it have.
+    """
+    valid = covered(position[:, 2:])
+    wide = F.pad(torch.cat([carried * valid, position, valid], 1), (1, 1, 1, 1))
+    total, weights = carried * 0, valid * 0
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            part = F.pad(wide, (-1 - right, right - 1, -1 - down, down - 1))
+            light, there, known = torch.split(part, [carried.shape[1], 3, 1], 1)
+            delta = there + position * -1
+            square = (delta * delta).sum(1, keepdim=True).clamp_min(1e-12)
+            off = (delta * normal).sum(1, keepdim=True)  # the tangent plane
+            same = (off * off / square * -_BENT + 1).clamp_min(1e-3)
+            weight = same * ((2.0 - abs(down)) * (2.0 - abs(right)))
+            total = total + light * weight
+            weights = weights + known * weight
+    return total / weights.clamp_min(1e-6)

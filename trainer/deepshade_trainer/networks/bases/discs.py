@@ -17,7 +17,9 @@ _RADII = (2.0, 3.0, 5.0, 9.0, 16.0, 24.0)
 _HALF = 5.0
 # Pooling and enlarging blur like a disc of about this radius, squared, at half and at a quarter.
 _SOFT, _SOFTER = 16 / 3, 24.0
+_HIDDEN = 10.0  # over about which radius what a near surface hides is continued
 _FAINT = 1e-4  # how much a sharp pixel counts in the blurred picture, so that it has no holes
+_CLOSED = 1e-6  # how much shows through what covers all, so that nothing divides by 0
 _SURE = 4.0  # weights end at e^±4
 
 
@@ -28,8 +30,9 @@ class Discs(Bases):
     the share of the lens that it covers. The classical answer lays the near side over what is
     in focus and that over the far side (layered depth of field: Scofield, "2½-D Depth-of-Field
     Simulation for Computer Animation", 1992; near and far fields: Jimenez, "Next Generation Post
-    Processing in Call of Duty: Advanced Warfare", 2014), each by its coverage, so that what was
-    hidden is continued from around. Two weights change how much the near and the far side count.
+    Processing in Call of Duty: Advanced Warfare", 2014), each by its coverage. What a near surface
+    hides from the pinhole and shows through its edge is continued from around. Three weights
+    change how much the near side, the far side and what is continued count.
 
     What is blurred is composited at half resolution and enlarged once. Its eight channels are
     coverage and premultiplied light of the near side, then of the far side: engines keep eight
@@ -37,7 +40,7 @@ class Discs(Bases):
     """
 
     told = 6
-    weights = 2
+    weights = 3
     size_multiple = 4
     cell = 2
     reach = 1
@@ -48,8 +51,12 @@ class Discs(Bases):
     both: Tensor
     light: Tensor
     one: Tensor
-    near: Tensor
-    coverage: Tensor
+    first: Tensor
+    over: Tensor
+    open: Tensor
+    before: Tensor
+    far: Tensor
+    hidden: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -57,15 +64,19 @@ class Discs(Bases):
         coverage = torch.tensor([1.0, 0, 0, 0]).repeat(2)  # (8,)
         light = torch.cat([torch.zeros(1, 3), torch.eye(3)]).repeat(2, 1)
         kernels = {
-            "sides": torch.tensor([-0.5, 0.5])[None, None, :, None, None],
-            "least": torch.tensor([0, _FAINT])[None, None, :, None, None],
+            "sides": torch.tensor([-0.5, 0.5])[None, :, None, None],
+            "least": torch.tensor([0, _FAINT])[None, :, None, None],
             "side": _pooling(side),
             "both": _pooling(torch.ones(8, 2)),
             "light": _pooling(light),
             "one": _pooling(coverage[:, None].repeat(1, 2)),
-            "near": side[:, 0][None, :, None, None],
-            "coverage": (side @ side.T * coverage)[:, :, None, None],
+            "first": coverage[None, :, None, None],
+            "over": (side[:, 1:] * side[:, 1] * coverage)[:, :, None, None],
+            "open": (side[:, 1:] * coverage)[:, :, None, None],
+            "before": side[:, 0],
+            "far": side[:, 1][None, :, None, None],
         }
+        kernels["hidden"] = _discs(_HIDDEN / 4, 4)
         for radius in _RADII[1:]:
             soft, size = (_SOFT, 2) if radius <= _HALF else (_SOFTER, 4)
             kernels[f"disc{radius:g}"] = _discs(math.sqrt(radius**2 - soft) / size, 8)
@@ -76,14 +87,14 @@ class Discs(Bases):
         """See `Bases.features`."""
         focal, light = gbuffer[:, :1], gbuffer[:, 1:]
         # (N, 1, 2, H, W), before and behind the focus: engines would pad 2 channels to 8
-        radius = F.relu(focal[:, :, None] * self.sides)
-        share = torch.maximum((radius / _RADII[0]).clamp(max=1), self.least)
+        radius = F.relu(focal[:, None] * self.sides[:, None])
+        share = (radius / _RADII[0]).clamp(max=1) + self.least[:, None]
         share, outer = share.flatten(1, 2), (share * radius).flatten(1, 2)  # (N, 2, H, W)
         blurred = focal.abs() * (0.5 / _RADII[0])
         # All from here on is (N, 8, H / 2, W / 2). A cell's light is of both sides, where it has.
         cover = F.conv2d(share, self.side, stride=2)
         reach = F.conv2d(outer, self.side, stride=2) / cover.clamp_min(1e-6)
-        lit = F.conv2d(light * blurred.clamp(_FAINT, 1), self.light, stride=2)
+        lit = F.conv2d(light * (blurred.clamp(max=1) + _FAINT), self.light, stride=2)
         lit = lit + F.conv2d(share, self.one, stride=2)
         lit = lit * (cover / F.conv2d(share, self.both, stride=2))
 
@@ -97,31 +108,42 @@ class Discs(Bases):
             return lit * torch.minimum(rise, fall).clamp(0, 1)
 
         mild, strong = layer(0), torch.zeros(())
+        # Before the focus all adds up. Behind it, what is blurred less is nearer and lies over the
+        # rest: what is sharp over all, the least blurred over what is two radii on.
+        # Through what reaches into the focus nothing shows, but through a wide near surface.
+        wide = torch.maximum((reach / _RADII[0] - 1).clamp(0, 1), self.far) * cover
+        share = F.conv2d(wide, self.open, self.before)
+        layers, under = mild * share, share - F.conv2d(mild, self.over)
         for k, size in enumerate(_RADII[1:], 1):
-            disc = getattr(self, f"disc{size:g}")
-            if size <= _HALF:
-                mild = mild + _spread(layer(k), disc)
-            else:
-                strong = strong + _spread(F.avg_pool2d(layer(k), 2), disc)
-        strong = _twice(strong)
-        # The nearer lies over the farther: before the focus that is what is blurred more.
-        over = mild + (strong - mild) * self.near
-        covered = F.conv2d(over, self.coverage).clamp(max=1)
-        layers = over + (mild + strong - over) * (1 - covered)
+            spread = getattr(self, f"disc{size:g}")
+            if size > _HALF:
+                strong = strong + _spread(F.avg_pool2d(layer(k), 2), spread)
+                continue
+            more = _spread(layer(k), spread)
+            layers = layers + more * (share if k == 1 else under.clamp(_CLOSED, 1))
+            mild = mild + more
+        under = share - F.conv2d(mild, self.over)
+        layers = layers + _twice(strong) * under.clamp(_CLOSED, 1)
+        # What a near surface hides.
+        other = light * (1 + focal * (0.5 / _RADII[0])).clamp(0, 1)
+        other = F.conv2d(other, self.light, stride=2) + (1 - cover) * self.first
+        hidden = _twice(_spread(F.avg_pool2d(other, 2)[:, :4], self.hidden))
+        seen = wide[:, :1] * (1 - layers[:, 4:5]).clamp_min(0)
+        hidden = hidden * (seen / hidden[:, :1].clamp_min(1e-6))
         told = torch.cat([layers[:, ::4], cover[:, ::4], reach[:, ::4] / _RADII[-1]], 1)
-        return told.clamp(max=2), (light, blurred, layers)
+        return told.clamp(max=2), (light, blurred, layers, hidden)
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
-        light, blurred, layers = state
+        light, blurred, layers, hidden = state
         gains = torch.split(torch.exp(torch.tanh(weights / _SURE) * _SURE), 1, 1)
         near, far = torch.split(layers, 4, 1)
         left = 1 - near[:, :1].clamp(max=1)
-        total = near * gains[0] + far * (left * gains[1])
+        total = near * gains[0] + far * (left * gains[1]) + hidden * (left * gains[2])
+        left, total, colour = torch.split(_twice(torch.cat([left, total], 1)), [1, 1, 3], 1)
         # nowhere 0: where nothing else is, there is what is faint
-        smooth = _twice(torch.cat([left, total[:, 1:] / total[:, :1]], 1))
-        sharp = (1 - blurred).clamp_min(0) * smooth[:, :1]
-        return smooth[:, 1:] + (light - smooth[:, 1:]) * sharp
+        smooth = colour / total
+        return smooth + (light - smooth) * ((1 - blurred).clamp_min(0) * left)
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""

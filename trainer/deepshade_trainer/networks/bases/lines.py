@@ -33,24 +33,17 @@ _SHARE = 2e-3
 class Lines(Bases):
     """Light along lines of motion: of (motion, light, depth) (N, 6, H, W).
 
-    `moments` is into how many the exposure is cut. Squares of 2 x 2 pixels are gathered together:
-    they share their lines, and a quarter of the copies is what engines are quick at.
+    `moments` is into how many the exposure is cut.
     """
 
-    told = 12
+    told = 11
     weights = 4
     size_multiple = _TILE
-
-    squares: Tensor
+    cell = 2
 
     def __init__(self, moments: int = 8) -> None:
         super().__init__()
         self.moments = moments
-        # Each pixel's square: itself, right, below, below right; four of each channel.
-        squares = torch.zeros(12, 3, 2, 2)
-        for channel in range(12):
-            squares[channel, channel // 4, channel % 4 // 2, channel % 2] = 1
-        self.register_buffer("squares", squares, persistent=False)
 
     def features(self, gbuffer: Tensor) -> tuple[Tensor, State]:
         """See `Bases.features`. Nothing here is learnt."""
@@ -61,111 +54,49 @@ class Lines(Bases):
         motion, light, depth = torch.split(gbuffer, [2, 3, 1], 1)
         motion = motion.clamp(-_LONGEST, _LONGEST)
         far = _doublings(depth)
-        count, _, height, width = gbuffer.shape
-        h, w = height // 2, width // 2
-        # A table each: engines copy whole rows much quicker than they split them afterwards.
-        rows_u, rows_v, rows_far = (
-            self._table(plane) for plane in (motion[:, :1], motion[:, 1:], far)
-        )
-        rows_light = self._table(light)
-        x = torch.arange(w, device=gbuffer.device, dtype=torch.float32) * 2
-        y = torch.arange(h, device=gbuffer.device, dtype=torch.float32)[:, None] * 2
-        first = torch.arange(count, device=gbuffer.device)[:, None, None] * (height * width)
-        own = sampled(motion, 2, 0)  # (N, 2, h, w)
-        strong = self._strongest(own)  # (N, 2, h, w)
-
-        def tap(line: Tensor, moment: float) -> tuple[Tensor, Tensor, Tensor]:
-            """Whether it covers (M, 4), its depth (M, 4), its light (M, 3, 4)."""
-            u, v = line[:, 0], line[:, 1]
-            column = (x - u * moment).round().clamp(0, width - 2)
-            row = (y - v * moment).round().clamp(0, height - 2)
-            at = (first + row.long() * width + column.long()).reshape(-1)
-            aside = rows_u[at] - u.reshape(-1, 1)
-            below = rows_v[at] - v.reshape(-1, 1)
-            miss = (aside * aside + below * below + 1e-12).sqrt() * abs(moment)
-            length = (u * u + v * v + 1e-12).sqrt().reshape(-1, 1)
-            covers = (2 - miss / (length * (0.2 * abs(moment)) + 1)).clamp(0, 1)
-            return covers, rows_far[at], rows_light[at].reshape(-1, 3, 4)
-
-        here = F.conv2d(far, self.squares[:4, :1], stride=2).permute(0, 2, 3, 1).reshape(-1, 4)
-        over, mine, gone, beyond = [], [], [], []
+        half = sampled(motion, 2, 0)  # (N, 2, H / 2, W / 2)
+        tiles = self._strongest(half)  # (N, 2, H / 16, W / 16)
+        strong = F.interpolate(tiles, scale_factor=float(_TILE), mode="nearest")
+        scene = torch.cat([motion, far, light], 1)
+        passes, stays = _Line(scene, strong), _Line(scene, motion)
+        sums = [torch.zeros_like(far) for _ in range(3)]
+        lights = [torch.zeros_like(light) for _ in range(3)]
         for k in range(self.moments):
             moment = (k + 0.5) / self.moments - 0.5
-            a, near, passing = tap(strong, moment)
-            b, same, carried = tap(own, moment)
+            a, near, passing = passes.at(moment)
+            b, same, carried = stays.at(moment)
             front = ((same - near) * _SHARP + 0.5).clamp(0, 1)
-            one = a * (1 - b * (1 - front))
-            two = b * (1 - a * front)
-            left = (1 - b) * (((same - here) * _SHARP + 1).clamp(0, 1) + 1e-2)
-            over.append((one, passing))
-            mine.append((two, carried))
-            beyond.append((left, carried))
-            gone.append(left)
-
-        def gathered(taps: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-            weight = torch.zeros_like(taps[0][0])
-            total = torch.zeros_like(taps[0][1])
-            for share, colour in taps:
-                weight = weight + share
-                total = total + share[:, None] * colour
-            return weight, total
-
-        def whole(cells: Tensor) -> Tensor:
-            """(M, 4) or (M, C, 4) to (N, C, H, W)."""
-            return F.pixel_shuffle(cells.reshape(count, h, w, -1).permute(0, 3, 1, 2), 2)
-
-        weight_over, light_over = gathered(over)
-        weight_mine, light_mine = gathered(mine)
-        weight_left, light_left = gathered(beyond)
-        scale = 1 / self.moments
-        covers, mines, lefts, passing, carried, uncovered = (
-            whole(cells * scale)
-            for cells in (
-                weight_over,
-                weight_mine,
-                weight_left,
-                light_over,
-                light_mine,
-                light_left,
-            )
-        )
+            uncovers = (1 - b) * (((same - far) * _SHARP + 1).clamp(0, 1) + 1e-2)
+            shares = a * (1 - b * (1 - front)), b * (1 - a * front), uncovers
+            for n, colour in enumerate((passing, carried, carried)):
+                sums[n] = sums[n] + shares[n]
+                lights[n] = lights[n] + shares[n] * colour
+        covers, mines, lefts = (each / self.moments for each in sums)
+        passing, carried, uncovered = (each / self.moments for each in lights)
         rest = (1 - covers - mines).clamp_min(0)
         uncovered = (uncovered + light * 1e-4) / (lefts + 1e-4)
-        told = torch.cat(
-            [
-                covers,
-                mines,
-                rest,
-                lefts,
-                _line(motion),
-                F.interpolate(_line(strong), scale_factor=2.0, mode="nearest"),
-                ((far - _NEAR) / (_FAR - _NEAR)),
-                (depth > 1e-6).to(depth.dtype),
-            ],
-            1,
-        )
-        return told, (light, covers, passing, mines, carried, rest, uncovered)
+        place = (sampled(far, 2, 0) - _NEAR) / (_FAR - _NEAR)
+        told = [
+            F.avg_pool2d(torch.cat([covers, mines, lefts], 1), 2),
+            _line(half),
+            F.interpolate(_line(tiles), scale_factor=_TILE / 2, mode="nearest"),
+            place,
+            (place < 1).to(place.dtype),
+        ]
+        return torch.cat(told, 1), (light, covers, passing, mines, carried, rest, uncovered)
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
         light, covers, passing, mines, carried, rest, uncovered = state
-        a, b, c, d = torch.split((torch.tanh(weights * 0.2) * 5).exp(), 1, 1)
+        gains = (torch.tanh(weights * 0.2) * 5).exp()
+        gains = F.interpolate(gains, scale_factor=2.0, mode="nearest")
+        a, b, c, d = torch.split(gains, 1, 1)
         c, d = c * (rest + 1e-4), d * _SHARE
         total = passing * a + carried * b + uncovered * c + light * d
         return total / (covers * a + mines * b + c + d)
 
-    def _table(self, planes: Tensor) -> Tensor:
-        """The squares that begin at each pixel of (N, C, H, W): (N H W, 4 C)."""
-        channels = planes.shape[1]
-        squares = self.squares[: 4 * channels, :channels]
-        return (
-            F.conv2d(F.pad(planes, (0, 1, 0, 1)), squares)
-            .permute(0, 2, 3, 1)
-            .reshape(-1, 4 * channels)
-        )
-
     def _strongest(self, own: Tensor) -> Tensor:
-        """Per 2 x 2 pixels (N, 2, h, w) the motion nearby that reaches farthest."""
+        """Per tile, of every second pixel's motion (N, 2, h, w), the one that reaches farthest."""
         size = _TILE // 2
         square = (own * own).sum(1, keepdim=True)
         most = F.max_pool2d(square, size)
@@ -189,7 +120,7 @@ class Lines(Bases):
                 better = (score > best).to(own.dtype)
                 best = torch.maximum(best, score)
                 found = found + (there[:, :2] - found) * better
-        return F.interpolate(found, scale_factor=float(size), mode="nearest")
+        return found
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Bases.receptive_field`."""
@@ -199,6 +130,39 @@ class Lines(Bases):
             min(pixel - reach, tile - _TILES * _TILE),
             max(pixel + reach, tile + (_TILES + 1) * _TILE - 1),
         )
+
+
+class _Line:
+    """What each pixel of a scene (motion, far, light) (N, 6, H, W) finds along a motion.
+
+    Offsets are whole pixels, so that no two engines round what lies between two differently.
+    """
+
+    def __init__(self, scene: Tensor, motion: Tensor) -> None:
+        self.scene, self.motion = scene, motion
+        self.length = (motion * motion).sum(1, keepdim=True).sqrt()
+        x, y = (
+            torch.arange(size, device=scene.device, dtype=scene.dtype) + 0.5
+            for size in (scene.shape[3], scene.shape[2])
+        )
+        self.place = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)  # (H, W, 2)
+        self.scale = 2 / (self.place[-1:, -1:] + 0.5)
+        self.last = motion.permute(0, 2, 3, 1)
+
+    def at(self, moment: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Whether what moves over the pixel then covers it (N, 1, H, W), how far it is, its light.
+
+        It covers in full where it misses by less than is allowed, and from twice that on not.
+        """
+        grid = (self.place - (self.last * moment).round()) * self.scale - 1
+        found = F.grid_sample(
+            self.scene, grid, mode="nearest", padding_mode="border", align_corners=False
+        )
+        motion, far, light = torch.split(found, [2, 1, 3], 1)
+        away = motion - self.motion
+        miss = (away * away).sum(1, keepdim=True)
+        allowed = abs(moment) / (self.length * (0.2 * abs(moment)) + 1)
+        return ((4 - miss * (allowed * allowed)) / 3).clamp(0, 1), far, light
 
 
 def _doublings(depth: Tensor) -> Tensor:

@@ -7,14 +7,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from deepshade_trainer.networks.bases.base import Bases, State
-from deepshade_trainer.networks.receptive_field import Span, grown, joined
+from deepshade_trainer.networks.receptive_field import Span, grown
 
 # Rows down and columns right.
 _AROUND = ((0, 1), (1, 0), (0, -1), (-1, 0))
-_BLOCK = 8  # pixels whose mean light is the unit that light is seen in
 _TINY = 1e-20  # of radiance: black is black
 # Shares begin small: a network that says nothing leaves the picture almost as it is.
-_START = -5.0
+_START = -4.0
 
 
 class Neighbours(Bases):
@@ -22,39 +21,46 @@ class Neighbours(Bases):
 
     A weight moves light from its neighbour: share_k = exp(weight_k) / (1 + Σ exp(weight)).
     (Blending with a neighbour is what morphological anti-aliasing does: Jimenez et al., "SMAA:
-    Enhanced Subpixel Morphological Antialiasing", 2012.) The network is told light relative to that
-    of the block of pixels, and the nearness.
+    Enhanced Subpixel Morphological Antialiasing", 2012.) The network is told edges: by how much
+    light and nearness (1 / depth; 0 in background) change to the right and downwards,
+    (a - b) / (a + b). So it sees neither exposure nor a scene's size, and a bright pixel only where
+    it is.
     """
 
-    told = 4
+    told = 8
     weights = 4
-    size_multiple = _BLOCK
 
     def features(self, gbuffer: Tensor) -> tuple[Tensor, State]:
         """See `Bases.features`."""
         depth, light = torch.split(gbuffer, [1, 3], 1)
-        count, _, height, width = light.shape
-        level = F.avg_pool2d(light, _BLOCK).mean(1, keepdim=True)  # (N, 1, H / 8, W / 8)
-        level = level[..., None, :, None] + _TINY
-        blocks = light.reshape(count, 3, height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
-        seen = (blocks / (blocks + level)).reshape(light.shape)  # in [0, 1], 1/2 for the level
-        near = (depth > 0) / (1 + depth)  # of the median depth; background is 0
-        return torch.cat([seen, near], 1), (light,)
+        near = (depth > 0) / (depth.abs() + _TINY)
+        seen = torch.cat([light, near], 1)
+        height, width = light.shape[2:]
+        wide = F.pad(seen, (0, 1, 0, 1), mode="replicate")
+        edges = [_step(seen, wide[:, :, :height, 1:]), _step(seen, wide[:, :, 1:, :width])]
+        return torch.cat(edges, 1), (light,)
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
         (light,) = state
-        height, width = light.shape[2:]
+        count, _, height, width = light.shape
         wide = F.pad(light, (1, 1, 1, 1), mode="replicate")
         image, total = light, torch.ones_like(light[:, :1])
-        shares = torch.split(torch.exp((weights + _START).clamp(max=12.0)), 1, 1)
-        for (down, right), share in zip(_AROUND, shares, strict=True):
+        # As rows of pixels: an engine that holds a pixel's channels together then puts each plane
+        # in one piece, all at once, where its split of channels is slow.
+        shares = torch.exp((weights + _START).clamp(max=12.0)).flatten(2).split(1, 1)
+        for (down, right), each in zip(_AROUND, shares, strict=True):
             rows, columns = slice(1 + down, 1 + down + height), slice(1 + right, 1 + right + width)
+            share = each.reshape(count, 1, height, width)
             image = image + share * wide[:, :, rows, columns]
             total = total + share
         return image / total
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        block = pixel // _BLOCK * _BLOCK
-        return joined(grown((pixel, pixel), 1), (block, block + _BLOCK - 1))
+        return grown((pixel, pixel), 1)
+
+
+def _step(here: Tensor, there: Tensor) -> Tensor:
+    """How one changes to the other, in [-1, 1]; 0 where both are 0."""
+    return (here - there) / (here.abs() + there.abs() + _TINY)
