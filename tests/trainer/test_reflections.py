@@ -1,10 +1,15 @@
 """Image-based lighting by look-ups, against sums over the map in float64, and on every engine."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import save
 
+from deepshade import judging, metrics
 from deepshade.bundles import Bundle
+from deepshade.effects import EFFECTS
 from deepshade.engines import load_engine, usable
 from deepshade.environments import (
     INPUTS,
@@ -15,6 +20,9 @@ from deepshade.environments import (
     solid_angles,
     world_to_map,
 )
+from deepshade.environments.stored import store
+from deepshade.manifest import Manifest, Shard
+from deepshade_trainer.evaluation import evaluate
 from deepshade_trainer.lookups import export_reflections, picture
 from deepshade_trainer.networks import phong
 from deepshade_trainer.networks.reflections import Reflections
@@ -189,3 +197,36 @@ def test_every_engine_gives_the_same(tmp_path, shaders, soft):
         np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-4)
         engine.shrink()
         np.testing.assert_array_equal(engine.predict(planes, given), found)
+
+
+@pytest.mark.slow
+def test_samples_are_judged_under_their_own_environment(tmp_path, shaders, soft):
+    """A data set whose references are the answers themselves, under a turned map."""
+    planes = picture(48)
+    given = soft.inputs(INPUTS, 65.0, "y")
+    with torch.inference_mode():
+        inputs = [torch.from_numpy(each) for each in (planes, *given.values())]
+        sample = {"reference_ibl": shaders[1](*inputs).numpy()[0]}
+    for name, place in shaders[1].places.items():
+        sample[name] = planes[0, place]
+    folder = tmp_path / "data"
+    store(folder, soft.environment)
+    content = save({name: array[None] for name, array in sample.items()})
+    (folder / "shard-00000.safetensors").write_bytes(content)
+    environment = {
+        "environment": "soft",
+        "environment_sha256": soft.environment.sha256,
+        "rotate": 65.0,
+    }
+    record = {"scene": "ball", "seed": 0, "camera": {}, **environment}
+    digest = hashlib.sha256(content).hexdigest()
+    schema = {n: {"dtype": "float32", "shape": list(a.shape)} for n, a in sample.items()}
+    Manifest({}, schema, [Shard("shard-00000.safetensors", digest, [record])]).write(folder)
+    bundle, _ = export_reflections(tmp_path / "ibl" / "small", lobes=1)
+    (row,) = evaluate(bundle, [folder], min_contrast=0)
+    assert row.figures["dssim"] < 1e-5
+    trivial = planes[:, 6:9] * soft.environment.mean[:, None, None]
+    image, nothing = judging.exposed(
+        EFFECTS["ibl"], sample["reference_ibl"], sample["reference_ibl"], trivial[0]
+    )
+    assert row.figures["trivial_dssim"] == pytest.approx(metrics.dssim(nothing, image))
