@@ -17,7 +17,7 @@ def train(
     data: Data,
     out: Annotated[Path, typer.Option(help="Run folder; an existing run goes on.")],
     preset: Annotated[
-        str, typer.Option(help="balanced or paper; ao has fast, best, paper-network.")
+        str, typer.Option(help="balanced, paper or paper-network; ao has fast and best.")
     ] = "balanced",
     settings: Annotated[
         list[str] | None,

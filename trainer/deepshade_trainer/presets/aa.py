@@ -1,6 +1,6 @@
 """Anti-aliasing."""
 
-from deepshade_trainer.presets.paper import PAPER
+from deepshade_trainer.presets.paper import paper
 
 PRESETS = {
     "balanced": {
@@ -14,5 +14,5 @@ PRESETS = {
             "up": (1,),
         }
     },
-    "paper": {**PAPER, "network": {"kind": "chain", "widths": (16,), "kernel": 5}},
+    **paper({"kind": "chain", "widths": (16,), "kernel": 5}),
 }

@@ -1,8 +1,7 @@
 """Ambient occlusion."""
 
-from deepshade_trainer.presets.paper import PAPER
+from deepshade_trainer.presets.paper import paper
 
-_NETWORK = {"kind": "paper", "u0": 8, "levels": 6}
 _BIAS = 0.85  # the mean of an occlusion image, or so
 
 PRESETS = {
@@ -29,7 +28,5 @@ PRESETS = {
             "bias": _BIAS,
         }
     },
-    "paper": {**PAPER, "network": _NETWORK},
-    # The paper's network, trained our way: what its shape costs, apart from its recipe.
-    "paper-network": {"network": _NETWORK},
+    **paper({"kind": "paper", "u0": 8, "levels": 6}),
 }

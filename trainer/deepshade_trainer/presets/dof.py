@@ -1,6 +1,6 @@
 """Depth of field."""
 
-from deepshade_trainer.presets.paper import PAPER
+from deepshade_trainer.presets.paper import paper
 
 PRESETS = {
     "balanced": {
@@ -12,5 +12,5 @@ PRESETS = {
             "up": (1, 1),
         }
     },
-    "paper": {**PAPER, "network": {"kind": "paper", "u0": 8, "levels": 5}},
+    **paper({"kind": "paper", "u0": 8, "levels": 5}),
 }

@@ -1,6 +1,6 @@
 """Indirect light."""
 
-from deepshade_trainer.presets.paper import PAPER
+from deepshade_trainer.presets.paper import paper
 
 PRESETS = {
     "balanced": {
@@ -12,5 +12,5 @@ PRESETS = {
             "position": 3,
         }
     },
-    "paper": {**PAPER, "network": {"kind": "paper", "u0": 16, "levels": 5}, "batch": 45},
+    **paper({"kind": "paper", "u0": 16, "levels": 5}, batch=45),
 }

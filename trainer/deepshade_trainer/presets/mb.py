@@ -1,6 +1,6 @@
 """Motion blur."""
 
-from deepshade_trainer.presets.paper import PAPER
+from deepshade_trainer.presets.paper import paper
 
 PRESETS = {
     "balanced": {
@@ -12,5 +12,5 @@ PRESETS = {
             "up": (1, 1),
         }
     },
-    "paper": {**PAPER, "network": {"kind": "paper", "u0": 16, "levels": 5}},
+    **paper({"kind": "paper", "u0": 16, "levels": 5}),
 }

@@ -1,4 +1,4 @@
-"""How the paper trains (section 4.3), apart from the network and the number of steps."""
+"""How the paper trains (section 4.3), apart from the number of steps, and what it trains."""
 
 from typing import Any
 
@@ -14,3 +14,14 @@ PAPER: dict[str, Any] = {
     "precision": "fp32",
     "batch": 16,
 }
+
+
+def paper(network: dict[str, Any], **settings: Any) -> dict[str, dict[str, Any]]:
+    """Presets of the paper's `network`: trained as in the paper, but for `settings`, and our way.
+
+    The second shows what its shape costs, apart from its recipe.
+    """
+    return {
+        "paper": {**PAPER, "network": network, **settings},
+        "paper-network": {"network": network},
+    }

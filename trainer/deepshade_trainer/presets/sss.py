@@ -1,8 +1,8 @@
 """Subsurface scattering."""
 
-from deepshade_trainer.presets.paper import PAPER
+from deepshade_trainer.presets.paper import paper
 
 PRESETS = {
     "balanced": {"network": {"kind": "carrier", "bases": "diffusion", "widths": (32, 64, 96)}},
-    "paper": {**PAPER, "network": {"kind": "paper", "u0": 16, "levels": 5}},
+    **paper({"kind": "paper", "u0": 16, "levels": 5}),
 }
