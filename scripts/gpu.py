@@ -110,6 +110,7 @@ def errors(bundle: Bundle, network: nn.Module, modes: Any, device: str) -> dict[
 def networks(models: Path) -> list[tuple[str, Bundle, nn.Module]]:
     """The paper's network of every effect, with random weights, and every bundle's."""
     bundles = [Bundle.load(folder) for folder in bundle_folders(models)]
+    bundles = [bundle for bundle in bundles if not bundle.environment]  # those are no networks
     effects = {bundle.effect: bundle for bundle in bundles}
     papers = {name: Shader(EFFECTS[name], build(preset("paper", name).network)) for name in effects}
     found = [(f"{name}, the paper's", effects[name], paper) for name, paper in papers.items()]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
@@ -44,6 +45,13 @@ def shade(
     focus: Annotated[float | None, typer.Option(help="Distance in focus, scene units.")] = None,
     aperture: Annotated[float | None, typer.Option(help="Lens diameter, scene units.")] = None,
     shutter: Annotated[float | None, typer.Option(help="Open for so many frames.")] = None,
+    environment: Annotated[
+        str | None, typer.Option(help="The map that lights the scene: see `environments`.")
+    ] = None,
+    rotate: Annotated[
+        float | None, typer.Option(help="Degrees to turn it by, counter-clockwise from above.")
+    ] = None,
+    up: Annotated[Literal["y", "z"] | None, typer.Option(help="The world's up axis.")] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
     map_: Annotated[
         list[str] | None,
@@ -97,6 +105,9 @@ def shade(
         focus=focus,
         aperture=aperture,
         shutter=shutter,
+        environment=environment,
+        rotate=rotate,
+        up=up,
         fov=fov,
         profile=profile,
         mapping=parse_mapping(map_ or []),
@@ -149,6 +160,27 @@ def effects(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
 
     found = _effects(server)
     (_print_json if as_json else print_effects)(found)
+
+
+@app.command()
+def environments(
+    add: Annotated[
+        list[Path] | None,
+        typer.Option(help="Send this map first, named as its file; repeatable.", exists=True),
+    ] = None,
+    server: Server = DEFAULT_SERVER,
+    as_json: AsJson = False,
+) -> None:
+    """List the environment maps of the service, and add some where it allows that."""
+    from deepshade_client.client import Client
+    from deepshade_client.report import print_environments
+    from deepshade_client.settings import Retry
+
+    with Client(server, retry=Retry(attempts=2)) as client:
+        for path in add or ():
+            client.add_environment(path.stem, path)
+        found = client.environments()
+    (_print_json if as_json else print_environments)(found)
 
 
 @app.command()

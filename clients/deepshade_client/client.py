@@ -18,6 +18,7 @@ from deepshade_client.request import (
     Options,
     Picture,
     base_url,
+    environment_request,
     get_request,
     read_answer,
     read_list,
@@ -88,6 +89,17 @@ class Client:
     def effect(self, name: str) -> dict[str, Any]:
         """One effect, as in `effects`."""
         return self._ask(get_request("effects", name), read_object)
+
+    def environments(self) -> list[dict[str, Any]]:
+        """Every environment map: name, source, and its hash and size once it has been used."""
+        return self._ask(get_request("environments"), read_list)
+
+    def add_environment(self, name: str, source: Path | str | bytes) -> dict[str, Any]:
+        """Add a map (EXR or HDR, latitude-longitude), or replace the one of that name.
+
+        Also raises OSError for a file that can't be read.
+        """
+        return self._ask(environment_request(name, source), read_object)
 
     def wait_until_ready(self) -> dict[str, Any]:
         """Returns once the service's models are loaded, within what `Retry` allows."""
@@ -183,6 +195,15 @@ class AsyncClient:
     async def effect(self, name: str) -> dict[str, Any]:
         """Like `Client.effect`."""
         return await self._ask(get_request("effects", name), read_object)
+
+    async def environments(self) -> list[dict[str, Any]]:
+        """Like `Client.environments`."""
+        return await self._ask(get_request("environments"), read_list)
+
+    async def add_environment(self, name: str, source: Path | str | bytes) -> dict[str, Any]:
+        """Like `Client.add_environment`; the file is read in a thread."""
+        request = await asyncio.to_thread(environment_request, name, source)
+        return await self._ask(request, read_object)
 
     async def wait_until_ready(self) -> dict[str, Any]:
         """Like `Client.wait_until_ready`."""

@@ -55,6 +55,16 @@ def print_effects(effects: Sequence[dict[str, Any]]) -> None:
     Console().print(table)
 
 
+def print_environments(environments: Sequence[dict[str, Any]]) -> None:
+    """A table of environment maps."""
+    table = Table("environment", "source", "size", "sha256")
+    for each in environments:
+        size = f"{each['width']} x {each['height']}" if each.get("width") else ""
+        cells = each["name"], each["source"], size, _cell(each.get("sha256"))
+        table.add_row(*map(escape, cells))
+    Console().print(table)
+
+
 def print_models(models: Sequence[dict[str, Any]]) -> None:
     """A table of bundles."""
     table = Table("effect", "bundle", "radius", "engine", "precision", "dssim", "sha256")

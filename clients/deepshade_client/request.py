@@ -39,7 +39,8 @@ class Options:
 
     `radius`, `focus` and `aperture` are in scene units, `shutter` in frames, `fov` is the full
     horizontal angle in degrees, `mapping` says which layer or comma-separated channels hold an
-    attribute, `half` asks for 16-bit pixels.
+    attribute, `half` asks for 16-bit pixels. `environment` names the map that lights the scene,
+    `rotate` turns it, in degrees, and `up` is the world's up axis.
 
     What shades: `quality` ("fast", "balanced", "best") or `bundle` by name; `max_error` (DSSIM)
     asks for the fastest within an error, `budget_ms` for the most accurate within a time of the
@@ -50,6 +51,9 @@ class Options:
     focus: float | None = None
     aperture: float | None = None
     shutter: float | None = None
+    environment: str | None = None
+    rotate: float | None = None
+    up: Literal["y", "z"] | None = None
     fov: float | None = None
     profile: str | None = None
     mapping: Mapping[str, str] | None = None
@@ -121,6 +125,13 @@ def base_url(server: str) -> httpx.URL:
             fix="write it like http://127.0.0.1:8000",
         ) from None
     return url
+
+
+def environment_request(name: str, source: Source) -> dict[str, Any]:
+    """The arguments of httpx's `request` that add an environment map; reads the file."""
+    url = f"environments/{quote(name, safe='')}"
+    headers = {"Content-Type": "application/octet-stream"}
+    return {"method": "POST", "url": url, "content": _named(source)[1], "headers": headers}
 
 
 def get_request(*path: str) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import typer
 
 from deepshade.bundles import Bundle, bundle_folders, bundle_root
 from deepshade.engines import choose, load_engine, usable
+from deepshade.environments import black
 from deepshade.machine import cpu_count, describe
 from deepshade.tensors import channel_slices, up
 
@@ -30,11 +31,12 @@ def milliseconds(bundle: Bundle) -> dict[str, float]:
     if place := channel_slices(bundle.inputs, bundle.per_channel).get("position"):
         gbuffer[:, place.stop - 1] = -np.abs(gbuffer[:, place.stop - 1]) - 4
     engines = {str(b): load_engine(bundle, b, threads=cpu_count()) for b in usable(bundle)}
+    given = (black(bundle.environment),) if bundle.environment else ()
     times: dict[str, list[float]] = {name: [] for name in engines}
     for turn in range(_ROUNDS + 2):
         for name, engine in engines.items():
             start = time.perf_counter()
-            engine.predict(gbuffer)
+            engine.predict(gbuffer, *given)
             if turn > 1:
                 times[name].append(1e3 * (time.perf_counter() - start))
     return {name: round(median(taken), 2) for name, taken in times.items()}

@@ -13,6 +13,7 @@ from typing import Any
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
+from deepshade.environments import INPUTS
 from deepshade.errors import BundleError, nearest
 from deepshade.files import replacing, sha256
 from deepshade.tensors import channel_count
@@ -39,10 +40,12 @@ class Bundle:
 
     `float32` names the tensors up to which the graph must be calculated in float32: arithmetic on
     lengths and light, which 16 bits would round. `float32_after` names those from which on it must
-    be again: weights that light is blended by. `int8` maps the weights of convolutions that may be
+    be again: weights that light is blended by. Where `float32` names the output, all must. `int8`
+    maps the weights of convolutions that may be
     calculated in 8 bits to the range of what they convolve, and `int8_kinds` are the kinds of CPU
     (`machine.cpu_kind`) on which that was found to add little error. `network` is the trainer's
-    configuration of the network, whose weights the graph holds by their own names. `ranges` are
+    configuration of the network, whose weights the graph holds by their own names. `environment`
+    names the graph's further inputs (`deepshade.environments.INPUTS`). `ranges` are
     the (lowest, highest) values seen in training; `hashes` maps file names to sha256.
     """
 
@@ -62,6 +65,7 @@ class Bundle:
     int8: dict[str, tuple[float, float]] = field(default_factory=dict)
     int8_kinds: tuple[str, ...] = ()
     network: dict[str, Any] = field(default_factory=dict)
+    environment: tuple[str, ...] = ()
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
     hashes: dict[str, str] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
@@ -78,6 +82,11 @@ class Bundle:
     def channels(self) -> int:
         """The channels of the graph's input."""
         return channel_count(self.inputs, self.per_channel)
+
+    @property
+    def exact(self) -> bool:
+        """Whether nothing of it may be calculated in 16 or 8 bits."""
+        return self.output_name in self.float32
 
     @property
     def sha256(self) -> str:
@@ -188,7 +197,7 @@ def _from_config(path: Path, config: Mapping[str, Any], metrics: dict[str, Any])
             )
     if MODEL not in values.get("hashes", {}):
         raise BundleError(f"{where}: 'hashes' has none for {MODEL}", fix="export it again")
-    for key in ("inputs", "outputs", "float32", "float32_after", "int8_kinds"):
+    for key in ("inputs", "outputs", "float32", "float32_after", "int8_kinds", "environment"):
         values[key] = tuple(values.get(key, ()))
     for key in ("ranges", "int8"):
         pairs = values.get(key, {})
@@ -256,6 +265,10 @@ _CHECKS: dict[str, tuple[Any, str]] = {
     "per_channel": (lambda v: isinstance(v, bool), "true or false"),
     "float32": (_tensors, "a list of names of the graph's tensors"),
     "float32_after": (_tensors, "a list of names of the graph's tensors"),
+    "environment": (
+        lambda v: isinstance(v, (list, tuple)) and set(v) <= set(INPUTS),
+        f"a list of {', '.join(INPUTS)}",
+    ),
     "int8": (_ranges, "pairs of numbers, lowest first"),
     "int8_kinds": (_tensors, "a list of kinds of CPU"),
     "network": (lambda v: isinstance(v, dict), "an object"),

@@ -13,11 +13,19 @@ from deepshade.effects import Effect
 Float = NDArray[np.float32]
 
 
-def trivial(effect: Effect, attributes: Mapping[str, Float], reference: Float) -> Float:
-    """The answer of doing nothing, shaped as the reference (C, H, W)."""
-    if isinstance(effect.trivial, str):
-        return np.broadcast_to(attributes[effect.trivial], reference.shape)
-    return np.full_like(reference, effect.trivial)
+def trivial(
+    effect: Effect,
+    attributes: Mapping[str, Float],
+    reference: Float,
+    environment: NDArray[np.floating] | None = None,
+) -> Float:
+    """The answer of doing nothing, shaped as the reference (C, H, W).
+
+    Under an `environment`, whose mean (3,) this is, it is multiplied by that.
+    """
+    factor = np.float32(1) if environment is None else environment[:, None, None]
+    plain = attributes[effect.trivial] if isinstance(effect.trivial, str) else effect.trivial
+    return np.broadcast_to(plain * factor, reference.shape).astype(np.float32)
 
 
 def exposed(effect: Effect, reference: Float, *images: Float) -> list[Float]:

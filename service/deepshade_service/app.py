@@ -20,8 +20,10 @@ from deepshade.engines import Engine
 from deepshade.errors import EngineError
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
+from deepshade_service import environment_routes as routes
 from deepshade_service import problems
-from deepshade_service.config import Settings
+from deepshade_service.config import Settings, environment_limits
+from deepshade_service.environments import Environments
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, not_ready
@@ -44,7 +46,10 @@ class Service:
         self.workers = Workers(settings.workers, settings.queue)
         self.uploads = Uploads(settings)
         self.memory = MemoryBudget(settings.memory)
-        self.shader = Shader(self.models, self.workers, self.memory, settings.limits)
+        self.environments = Environments(settings.environments, environment_limits(settings.limits))
+        self.shader = Shader(
+            self.models, self.workers, self.memory, settings.limits, self.environments
+        )
         self.telemetry = Telemetry(
             queued=lambda: self.workers.taken, held=lambda: self.uploads.held
         )
@@ -64,6 +69,8 @@ class Service:
     async def shade(self, effect: str, request: Request, asked: ShadeParameters) -> Shaded:
         """Receive, queue and shade one picture."""
         candidates = allowed(self.models, effect, asked)
+        if asked.environment is not None:
+            self.environments.check(asked.environment)
         self.workers.check_place()  # before the body is received, to spare both sides the work
         async with self.uploads.receive(request) as files:
             with self.workers.place():
@@ -133,6 +140,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @app.get("/effects/{effect}", tags=["effects"], summary="One effect: inputs, bundles, metrics")
     async def one_effect(effect: str) -> dict[str, Any]:
         return _effect(find_effect(effect).name, service.models)
+
+    routes.install(app, service.environments, service.uploads, service.settings)
 
     @app.get("/healthz", tags=["operation"], summary="Is the process alive?")
     async def healthz() -> dict[str, str]:

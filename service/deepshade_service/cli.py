@@ -26,6 +26,14 @@ def serve(
             " the models that came with the sources."
         ),
     ] = None,
+    environments: Annotated[
+        Path | None,
+        typer.Option(help="Folder of environment maps, latitude-longitude .exr and .hdr."),
+    ] = None,
+    environment_uploads: Annotated[
+        bool,
+        typer.Option("--allow-environment-uploads", help="Let requests add maps to that folder."),
+    ] = False,
     engine: Annotated[
         str | None,
         typer.Option(help="What networks run on, as onnxruntime. Default: the first there is."),
@@ -75,6 +83,8 @@ def serve(
         raise ConfigError(
             "models", detail=f"there is no folder {models}; --models says where the bundles are"
         )
+    if environments is not None and not environments.is_dir():
+        raise ConfigError("environments", detail=f"there is no folder {environments}")
     if engine or precision:
         check_backend(engine, precision)  # said now, and not by every answer
     given = {
@@ -87,6 +97,8 @@ def serve(
     uploads = parse_size(max_uploads) if max_uploads else 0
     settings = Settings(
         models=models,
+        environments=environments,
+        environment_uploads=environment_uploads,
         engine=engine,
         precision=precision,
         limits=replace(default_limits(uploads), **{k: v for k, v in given.items() if v}),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from deepshade.bundles import bundle_root
+from deepshade.environments import LIMITS
 from deepshade.errors import ConfigError
 from deepshade.exr import Limits
 from deepshade.machine import cpu_count, memory_bytes
@@ -29,6 +30,12 @@ def default_limits(uploads: int | None = None) -> Limits:
     return Limits(body_bytes=min(Limits().body_bytes, (uploads or default_uploads()) // 2))
 
 
+def environment_limits(limits: Limits) -> Limits:
+    """Those of an environment map, where the service's own aren't tighter."""
+    least = {f.name: min(getattr(limits, f.name), getattr(LIMITS, f.name)) for f in fields(Limits)}
+    return Limits(**least)
+
+
 @dataclass(frozen=True, slots=True)
 class Settings:
     """Everything an operator can set. Sizes are bytes, times are seconds.
@@ -38,10 +45,13 @@ class Settings:
     service; tiles are cut to fit. `uploads` bounds, besides, the bodies held while they arrive
     (twice their bytes) and wait; 0 is the default for this machine, or what the largest body needs.
     `engine` and `precision` pin what requests run on that pin nothing themselves; None leaves it
-    to the rule (`deepshade.engines.choose`).
+    to the rule (`deepshade.engines.choose`). `environments` is a folder of environment maps, into
+    which requests may add more if `environment_uploads`.
     """
 
     models: Path = field(default_factory=bundle_root)
+    environments: Path | None = None
+    environment_uploads: bool = False
     engine: str | None = None
     precision: str | None = None
     limits: Limits = field(default_factory=default_limits)
@@ -65,6 +75,11 @@ class Settings:
             "uploads",
             self.uploads >= most,
             f"at least twice the largest body, {most:,} bytes (--max-uploads, --max-body)",
+        )
+        _require(
+            "environment_uploads",
+            self.environments is not None or not self.environment_uploads,
+            "off, or there must be a folder for them (--environments)",
         )
         _require("queue", self.queue >= 0, "0 or more")
         for key in ("body_timeout", "idle_trim", "grace"):

@@ -17,6 +17,9 @@ from deepshade_service.problems import Problem
 
 LENS = ("focus", "aperture")  # settings from which the blur circle is derived
 CAMERA = (*LENS, "shutter")
+LIGHT = ("environment", "rotate", "up")  # only effects lit by an environment have them
+
+MAX_TURN = 36000.0
 
 Compression = StrEnum("Compression", {name: name for name in COMPRESSIONS})  # type: ignore[misc]
 Profile = StrEnum("Profile", {name: name for name in PROFILES})  # type: ignore[misc]
@@ -43,6 +46,24 @@ class ShadeParameters(BaseModel):
     aperture: Annotated[float | None, _setting("aperture")] = None
     shutter: Annotated[
         float | None, _setting("shutter", ", for which its motion holds; that is scaled")
+    ] = None
+    environment: Annotated[
+        str | None,
+        Field(description="The map that lights the scene (GET /environments); else `sky`."),
+    ] = None
+    rotate: Annotated[
+        float | None,
+        Field(
+            ge=-MAX_TURN,
+            le=MAX_TURN,
+            allow_inf_nan=False,
+            description="Degrees by which the map is turned about the world's up axis,"
+            " counter-clockwise as seen from above.",
+        ),
+    ] = None
+    up: Annotated[
+        Literal["y", "z"] | None,
+        Field(description="The world's up axis; else the one of the renderer, else `y`."),
     ] = None
     fov: Annotated[
         float | None,
@@ -126,8 +147,9 @@ class ShadeParameters(BaseModel):
 
     def check(self, effect: Effect) -> None:
         """Raises Problem 422 for a setting that the effect doesn't have."""
-        for name in ("radius", *CAMERA):
-            if getattr(self, name) is not None and name not in effect.settings:
+        for name in ("radius", *CAMERA, *LIGHT):
+            setting = "environment" if name in LIGHT else name
+            if getattr(self, name) is not None and setting not in effect.settings:
                 raise Problem(
                     422,
                     "bad-parameter",

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from math import prod
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepshade import exr
 from deepshade.effects import EFFECTS, SETTINGS
+from deepshade.environments import Environment, Up
 from deepshade.gbuffer import GBuffer
 from deepshade_service.memory import Need
 from deepshade_service.parameters import CAMERA, ShadeParameters
@@ -25,13 +27,36 @@ _ASKED = ("quality", "bundle", "max_error", "budget_ms", "engine", "precision")
 
 
 @dataclass(frozen=True, slots=True)
+class Lighting:
+    """The environment that lights the scene, turned by `rotate` degrees in a world `up` up."""
+
+    environment: Environment
+    rotate: float
+    up: Up
+
+    def facts(self) -> Json:
+        """For plans and headers."""
+        return {
+            "environment": self.environment.name,
+            "environment_sha256": self.environment.sha256,
+            "rotate": self.rotate,
+            "up": self.up,
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class ShadePlan:
-    """What will be computed: at which radius (scene units), in which tiles, all of one `shape`."""
+    """What will be computed: at which radius (scene units), in which tiles, all of one `shape`.
+
+    `given` are the network's inputs beside the picture, of the lighting.
+    """
 
     radius: float
     radius_source: str
     shape: tuple[int, int]
     tiles: tuple[Tile, ...]
+    lighting: Lighting | None = None
+    given: Mapping[str, NDArray[np.float32]] = field(default_factory=dict, repr=False)
 
     @property
     def computed(self) -> int:
@@ -81,7 +106,8 @@ def facts_of(gbuffer: GBuffer, plan: ShadePlan, made: Json) -> Facts:
     `made` is the plan as JSON. What isn't known is left out.
     """
     names = ("effect", "bundle", "bundle_sha256", "engine", "precision", "dssim", "radius")
-    facts = {name: made.get(name) for name in (*names, "radius_source", *CAMERA)}
+    more = "radius_source", *CAMERA, "environment", "environment_sha256", "rotate", "up"
+    facts = {name: made.get(name) for name in (*names, *more)}
     return {name: fact for name, fact in facts.items() if fact is not None} | {
         "mapped": _listed(gbuffer.mapped),
         "derived": _listed(gbuffer.derived),
@@ -98,6 +124,8 @@ def _settings(gbuffer: GBuffer, effect: str, plan: ShadePlan) -> Json:
     found: Json = {}
     if "radius" in known:
         found |= {"radius": plan.radius, "radius_source": plan.radius_source}
+    if plan.lighting is not None:
+        found |= plan.lighting.facts()
     for name in CAMERA:
         if name in known and (value := gbuffer.header.get(SETTINGS[name].header)) is not None:
             found[name] = value if isinstance(value, float) else str(value)

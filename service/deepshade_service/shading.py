@@ -7,7 +7,7 @@ import json
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,14 @@ from deepshade import exr, pictures, tensors
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS, SETTINGS, Setting
 from deepshade.engines import Engine
+from deepshade.environments import Prepared
 from deepshade.gbuffer import GBuffer, load_gbuffer
 from deepshade.machine import trim
+from deepshade_service.environments import DEFAULT, Environments
 from deepshade_service.memory import MemoryBudget, Need, need_of, size_of
 from deepshade_service.models import Models
-from deepshade_service.parameters import LENS, ShadeParameters
-from deepshade_service.plan import Facts, Json, ShadePlan, explain, facts_of
+from deepshade_service.parameters import LENS, LIGHT, ShadeParameters
+from deepshade_service.plan import Facts, Json, Lighting, ShadePlan, explain, facts_of
 from deepshade_service.problems import Problem
 from deepshade_service.selection import Candidate, Selection, select
 from deepshade_service.telemetry import Stopwatch
@@ -55,6 +57,7 @@ class Shader:
     workers: Workers
     memory: MemoryBudget
     limits: exr.Limits
+    environments: Environments
 
     async def shade(
         self, files: list[Upload], asked: ShadeParameters, candidates: list[Candidate]
@@ -76,6 +79,8 @@ class Shader:
                 gbuffer = decode(files, headers, bundle, asked, self.limits)
             with watch.time("plan"):
                 plan = plan_shading(gbuffer, bundle, asked, need.max_pixels)
+                if prepared is not None:
+                    plan = lit(plan, prepared, gbuffer, bundle, asked)
                 made = explain(gbuffer, headers, selection, asked, plan, need)
                 facts = facts_of(gbuffer, plan, made)
             if engine is None:
@@ -91,9 +96,27 @@ class Shader:
         selection = await self._select(headers, asked, candidates)
         bundle = selection.bundle
         need = need_of(headers, bundle, self.memory.total)
+        prepared = await self._environment(bundle, asked)
         engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
         async with self.memory.hold(need.total):
             return await self.workers.run(_giving_back(engine, need)(work))
+
+    async def _environment(self, bundle: Bundle, asked: ShadeParameters) -> Prepared | None:
+        """The environment that the bundle is to be given, if it takes one.
+
+        Raises Problem 422 where one is asked for that it can't be given.
+        """
+        if bundle.environment:
+            return await self.environments.get(asked.environment or DEFAULT)
+        for name in LIGHT:
+            if getattr(asked, name) is not None:
+                raise Problem(
+                    422,
+                    "bad-parameter",
+                    f"the bundle '{bundle.name}' knows no environment but the one it learnt",
+                    fix=f"leave out ?{name}=, or choose another ?bundle=",
+                )
+        return None
 
     async def _select(
         self, headers: list[exr.Header], asked: ShadeParameters, candidates: list[Candidate]
@@ -181,6 +204,15 @@ def plan_shading(
     return ShadePlan(radius, source, grid.shape, tiles)
 
 
+def lit(
+    plan: ShadePlan, prepared: Prepared, gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters
+) -> ShadePlan:
+    """The plan with its lighting: the world's up axis is the one asked for, else the renderer's."""
+    lighting = Lighting(prepared.environment, asked.rotate or 0.0, asked.up or gbuffer.up)
+    given = prepared.inputs(bundle.environment, lighting.rotate, lighting.up)
+    return replace(plan, lighting=lighting, given=given)
+
+
 def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threading.Event) -> Float:
     """(C', H, W): the network's answer, and the effect's background where there is none.
 
@@ -197,7 +229,8 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
         for tile in plan.tiles:
             if cancelled.is_set():
                 raise Cancelled
-            answer = engine.predict(tensors.cut(planes, tile.box))[0][:, *tile.inner]
+            given = (plan.given,) if plan.given else ()
+            answer = engine.predict(tensors.cut(planes, tile.box), *given)[0][:, *tile.inner]
             if answer.shape == shade.shape:
                 shade = answer  # all of it at once: no copy
             else:

@@ -20,6 +20,8 @@ from torch import Tensor
 from deepshade import symmetry, tensors
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
+from deepshade.environments import Prepared
+from deepshade.environments.stored import read_stored
 from deepshade.errors import DataError
 from deepshade.files import sha256
 from deepshade.manifest import Manifest, shard_path
@@ -121,6 +123,17 @@ class Dataset:
         """The effect radius that a sample was rendered with; 1 for an effect without."""
         return float(self.entries[number].record.get("radius", 1.0))
 
+    def environment(self, number: int) -> tuple[Prepared, float] | None:
+        """The map that a sample was rendered under, and how far it was turned, in degrees.
+
+        None where it was under none. Raises DataError: the map isn't there.
+        """
+        entry = self.entries[number]
+        if "environment_sha256" not in entry.record:
+            return None
+        digest, name = (entry.record[key] for key in ("environment_sha256", "environment"))
+        return _prepared(entry.path.parent, digest, name), float(entry.record["rotate"])
+
     def gbuffer(self, sample: Sample, radius: float, multiple: int = 1) -> NDArray[np.float32]:
         """What a network sees of a sample (N, C, h, w); N is 3 for networks run per channel.
 
@@ -156,6 +169,11 @@ class Dataset:
             some = slice(None) if channel is None else slice(channel, channel + 1)
             references.append(turned[self.reference][some])
         return torch.from_numpy(np.stack(inputs)), torch.from_numpy(np.stack(references))
+
+
+@lru_cache(maxsize=2)
+def _prepared(folder: Path, digest: str, name: str) -> Prepared:
+    return Prepared.of(read_stored(folder, digest, name))
 
 
 def lengths(names: Iterable[str]) -> list[str]:

@@ -14,6 +14,7 @@ from deepshade import judging, metrics, pictures
 from deepshade.bundles import Bundle
 from deepshade.effects import Effect
 from deepshade.engines import REFERENCE, Backend, load_engine
+from deepshade.environments import Prepared
 from deepshade.errors import ConfigError, DataError
 from deepshade.machine import cpu_count
 from deepshade_trainer.dataset import Dataset, Sample, directions, lengths, rounded, shortened
@@ -69,11 +70,23 @@ class Shaded:
         self.backend = backend
         self.engine = load_engine(bundle, backend, threads=cpu_count())
 
-    def __call__(self, data: Dataset, sample: Sample, radius: float) -> Image:
-        """The answer (C, H, W), C of an effect run per channel from three runs."""
+    def __call__(
+        self,
+        data: Dataset,
+        sample: Sample,
+        radius: float,
+        lit: tuple[Prepared, float] | None = None,
+    ) -> Image:
+        """The answer (C, H, W), C of an effect run per channel from three runs.
+
+        `lit` is the sample's environment (`Dataset.environment`).
+        """
         height, width = sample[data.reference].shape[1:]
         gbuffer = data.gbuffer(sample, radius, self.bundle.size_multiple)
-        shaded: Image = self.engine.predict(gbuffer)
+        if self.bundle.environment and lit is None:
+            raise DataError(f"the samples have no environment, which {self.bundle.name} needs")
+        given = lit[0].inputs(self.bundle.environment, lit[1], "y") if lit else {}
+        shaded: Image = self.engine.predict(gbuffer, given)
         return shaded.reshape(-1, *shaded.shape[2:])[:, :height, :width]
 
 
@@ -105,12 +118,14 @@ def evaluate(
     for number, entry in enumerate(data.entries):
         sample = data.load(number)
         reference = sample[data.reference]
-        blank = judging.trivial(effect, sample, reference)
+        lit = data.environment(number)
+        mean = lit[0].environment.mean if lit else None
+        blank = judging.trivial(effect, sample, reference, mean)
         contrast = judging.contrast(effect, reference, blank)
         if contrast < least:
             continue
         changed, radius = variant.apply(sample, effect.inputs, data.radius(number))
-        image = shader(data, changed, radius)
+        image = shader(data, changed, radius, lit)
         ours, truth, nothing = judging.exposed(effect, reference, image, reference, blank)
         figures = compare(ours, truth, nothing)
         if effect.is_light:

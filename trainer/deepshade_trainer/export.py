@@ -138,7 +138,7 @@ def write_onnx(shader: Shader, path: Path) -> Any:
     free = {0: "batch", 2: "height", 3: "width"}
     with TemporaryDirectory() as scratch, replacing(path) as temporary:
         raw = Path(scratch) / MODEL
-        with _quiet(), torch.inference_mode():
+        with quiet(), torch.inference_mode():
             register = torch.onnx.register_custom_op_symbolic  # type: ignore[attr-defined]
             register("aten::expm1", _expm1, OPSET)
             torch.onnx.export(
@@ -185,7 +185,7 @@ def _expm1(graph: Any, y: Any) -> Any:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """The exporter warns about things that hold here on purpose."""
     level = logging.getLogger("torch.onnx").level
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -103,11 +103,17 @@ def float32_marks(model: Any, rounded: str = "") -> tuple[list[str], list[str]]:
     return list(boundary), list(dict.fromkeys(again))
 
 
-def bytes_per_pixel(model: Any, name: str, shape: tuple[int, int, int]) -> int:
+def bytes_per_pixel(
+    model: Any,
+    name: str,
+    shape: tuple[int, int, int],
+    further: Mapping[str, NDArray[np.float32]] | None = None,
+) -> int:
     """The most memory, in bytes a pixel, that tensors take at any time of a prediction in float32.
 
     `shape` is (channels, height, width) of a picture for the input `name`. A tensor lives from the
-    node that makes it to the last that reads it; input and output count.
+    node that makes it to the last that reads it; input and output count, but not the `further`
+    inputs.
     """
     import onnx
     import onnxruntime as ort
@@ -120,7 +126,10 @@ def bytes_per_pixel(model: Any, name: str, shape: tuple[int, int, int]) -> int:
     session = ort.InferenceSession(watched.SerializeToString(), providers=["CPUExecutionProvider"])
     picture = np.zeros((1, *shape), np.float32)
     sizes: dict[str, int] = {
-        each: v.nbytes for each, v in zip(names, session.run(names, {name: picture}), strict=True)
+        each: v.nbytes
+        for each, v in zip(
+            names, session.run(names, {name: picture, **(further or {})}), strict=True
+        )
     }
     sizes[name] = picture.nbytes
     last = {source: k for k, node in enumerate(model.graph.node) for source in _sources(node)}

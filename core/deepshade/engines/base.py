@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.bundles import Bundle
+from deepshade.environments import black
 
 Float = NDArray[np.float32]
 
@@ -44,9 +46,10 @@ class Engine(ABC):
         """Lay out the weights by a first small prediction, and time a second."""
         side = -(-_WARM // self.bundle.size_multiple) * self.bundle.size_multiple
         example = np.zeros((1, self.bundle.channels, side, side), np.float32)
-        self.predict(example)
+        given = (black(self.bundle.environment),) if self.bundle.environment else ()
+        self.predict(example, *given)
         start = time.perf_counter()
-        self.predict(example)
+        self.predict(example, *given)
         self.ms_per_megapixel = 1e3 * (time.perf_counter() - start) / (side * side / 1e6)
         self.shrink()
 
@@ -54,8 +57,11 @@ class Engine(ABC):
         """Compile what the first prediction of this size would have to; blocks."""
 
     @abstractmethod
-    def predict(self, gbuffer: Float) -> Float:
-        """(N, C, H, W) to (N, C', H, W), H and W multiples of the bundle's size multiple."""
+    def predict(self, gbuffer: Float, environment: Mapping[str, Float] | None = None) -> Float:
+        """(N, C, H, W) to (N, C', H, W), H and W multiples of the bundle's size multiple.
+
+        `environment` holds the graph's further inputs, where the bundle names some.
+        """
 
     @abstractmethod
     def shrink(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, cast
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine, Float
+from deepshade.environments import black
 from deepshade.errors import EngineError
 
 _PROVIDERS = {"onnxruntime": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
@@ -38,17 +40,18 @@ class OnnxRuntime(Engine):
             "cpu:0;gpu:0" if backend.engine == "cuda" else "cpu:0",
         )
 
-    def predict(self, gbuffer: Float) -> Float:
+    def predict(self, gbuffer: Float, environment: Mapping[str, Float] | None = None) -> Float:
         """See `Engine.predict`."""
-        return self._run(gbuffer)
+        return self._run(gbuffer, environment or {})
 
     def shrink(self) -> None:
         """See `Engine.shrink`."""
         side = self.bundle.size_multiple
-        self._run(np.zeros((1, self.bundle.channels, side, side), np.float32), self._shrinking)
+        picture = np.zeros((1, self.bundle.channels, side, side), np.float32)
+        self._run(picture, black(self.bundle.environment), self._shrinking)
 
-    def _run(self, gbuffer: Float, options: Any = None) -> Float:
-        given = {self.bundle.input_name: gbuffer}
+    def _run(self, gbuffer: Float, environment: Mapping[str, Float], options: Any = None) -> Float:
+        given = {self.bundle.input_name: gbuffer, **environment}
         (shade,) = self._session.run([self.bundle.output_name], given, options)
         return cast(Float, shade)
 

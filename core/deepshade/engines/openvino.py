@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache
@@ -75,10 +75,10 @@ class OpenVino(Engine):
         """See `Engine.prepare`."""
         self._network((1, self.bundle.channels, height, width))
 
-    def predict(self, gbuffer: Float) -> Float:
+    def predict(self, gbuffer: Float, environment: Mapping[str, Float] | None = None) -> Float:
         """See `Engine.predict`."""
         network = self._network(gbuffer.shape)
-        shade = network.run(gbuffer)
+        shade = network.run(gbuffer, environment or {})
         self._bound(network)
         return shade
 
@@ -108,7 +108,7 @@ class OpenVino(Engine):
     def _compile(self, shape: Shape) -> _Network:
         model = self._model.clone()
         try:
-            model.reshape(list(shape))
+            model.reshape({self.bundle.input_name: list(shape)})
             marks = self.bundle.float32, self.bundle.float32_after
             pieces = split(model, *(marks if self._type != "f32" else ()))
             settings = {
@@ -150,12 +150,15 @@ class _Network:
         self._idle: list[list[Any]] = []
         self._lock = threading.Lock()
 
-    def run(self, gbuffer: Float) -> Float:
+    def run(self, gbuffer: Float, environment: Mapping[str, Float]) -> Float:
         """(N, C, H, W) to (N, C', H, W)."""
         from openvino import Tensor
 
         with self._requests() as requests:
-            handed: dict[str, Any] = {}
+            handed = {
+                name: Tensor(np.ascontiguousarray(value), shared_memory=True)
+                for name, value in environment.items()
+            }
             count, _, height, width = gbuffer.shape
             shade = np.empty((count, self._outputs, height, width), np.float32)
             requests[-1].set_output_tensor(0, Tensor(shade, shared_memory=True))

@@ -35,8 +35,14 @@ def available() -> tuple[Backend, ...]:
 
 
 def usable(bundle: Bundle) -> list[Backend]:
-    """`available`, less 8 bits where the bundle has no ranges for them."""
-    return [one for one in available() if one.precision != "int8" or bundle.int8]
+    """`available`, less 8 bits where the bundle has no ranges for them, and less all but float32
+    where it bears no other."""
+    return [
+        one
+        for one in available()
+        if one.precision == "fp32"
+        or not (bundle.exact or (one.precision == "int8" and not bundle.int8))
+    ]
 
 
 def choose(bundle: Bundle, engine: str | None = None, precision: str | None = None) -> Backend:

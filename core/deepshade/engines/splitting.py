@@ -29,7 +29,8 @@ def split(model: Any, float32: Sequence[str] = (), after: Sequence[str] = ()) ->
 
     Where a graph begins by taking some channels of the picture, those become inputs of its own:
     they lie one after the other in memory, and to take them inside is to copy them. `model`,
-    whose only input is the picture, stays as it is. Raises EngineError if it lacks such a tensor.
+    whose first input is the picture, stays as it is; others are taken by whichever piece needs
+    them. Raises EngineError if it lacks such a tensor.
     """
     from openvino import opset13
 
@@ -39,7 +40,7 @@ def split(model: Any, float32: Sequence[str] = (), after: Sequence[str] = ()) ->
     for names, exact in [*marks, ((), bool(after))]:
         part = model.clone()
         outputs = _tensors(part, names) or [node.input_value(0) for node in part.get_results()]
-        entries = {}
+        entries = {_name(node): node for node in part.get_parameters()[1:]}
         for name, tensor in zip(known, _tensors(part, known), strict=True):
             entry = opset13.parameter(tensor.get_partial_shape(), tensor.get_element_type())
             for reader in tensor.get_target_inputs():
@@ -71,7 +72,7 @@ def _views(model: Any) -> dict[str, tuple[Any, slice]]:
     """The picture, and what is cut out of its channels, as inputs: name -> (input, channels)."""
     from openvino import opset13
 
-    (picture,) = model.get_parameters()
+    picture = model.get_parameters()[0]
     views = {_name(picture): (picture, slice(None))}
     for entry in picture.output(0).get_target_inputs():
         node = entry.get_node()

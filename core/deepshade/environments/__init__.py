@@ -13,13 +13,17 @@ from deepshade.environments.environment import (
     solid_angles,
     world_to_map,
 )
+from deepshade.environments.inputs import INPUTS, Prepared, black
 from deepshade.environments.sky import sky
 
 __all__ = [
+    "INPUTS",
     "LIMITS",
     "SUFFIXES",
     "Environment",
+    "Prepared",
     "Up",
+    "black",
     "directions",
     "read_environment",
     "sky",

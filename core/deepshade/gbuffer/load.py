@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ class GBuffer:
     `decoded` all that were read for that, as (file, channel), and `derived` how the others were
     computed. The windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes
     came from, `part_header` its own attributes; `header` holds those of all parts and files, the
-    first of each name.
+    first of each name. `up` is the world's up axis, as its renderer has it.
     """
 
     attributes: dict[str, NDArray[np.float32]]
@@ -48,6 +48,7 @@ class GBuffer:
     part_header: dict[str, Any] = field(default_factory=dict)
     data_window: exr.Window = (0, 0, 0, 0)
     display_window: exr.Window = (0, 0, 0, 0)
+    up: Literal["y", "z"] = "y"
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -126,6 +127,7 @@ def load_gbuffer(
         part_header=part.attributes,
         data_window=part.data_window,
         display_window=part.display_window,
+        up=planned.profile.up if planned.profile else "y",
     )
 
 

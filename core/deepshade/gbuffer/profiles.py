@@ -45,15 +45,16 @@ class Source:
 class Profile:
     """One renderer's conventions: its names for quantities, and the files that `made_by` knows.
 
-    `world` is the handedness of world space. `free_names` are only a scene's author's, and count
-    in files of that renderer alone. `fov` are header attributes with the horizontal field of view
-    in degrees, and `matrix` makes worldToCamera of others.
+    `world` is the handedness of world space, and `up` its up axis. `free_names` are only a scene's
+    author's, and count in files of that renderer alone. `fov` are header attributes with the
+    horizontal field of view in degrees, and `matrix` makes worldToCamera of others.
     """
 
     name: str
     sources: tuple[Source, ...]
     made_by: Callable[[Header], bool]
     world: Literal["right", "left"] = "right"
+    up: Literal["y", "z"] = "y"
     free_names: bool = False
     fov: tuple[str, ...] = ()
     matrix: Callable[[Header], NDArray[np.float64] | None] | None = None
@@ -153,6 +154,7 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("Vector",), _UP_TO_DOWN, components="zw"),
         ),
         _blender,
+        up="z",
     ),
     Profile(
         "mitsuba",
@@ -197,6 +199,7 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("velocity",), _UP_TO_DOWN),
         ),
         _signed("vray", "VRay"),
+        up="z",
     ),
     Profile(
         "unreal",
@@ -210,6 +213,7 @@ _TABLE: Sequence[Profile] = (
             Source("diffuse", ("BaseColor", "FinalImageBaseColor")),
         ),
         _signed("unreal/"),
+        up="z",
         world="left",
         fov=("unreal/camera/FinalImage/fov", "unreal/camera/fov"),
         matrix=_unreal_matrix,
