@@ -75,7 +75,7 @@ def _shade(lit: Lit, kind: str, threshold: float, *given: float) -> Any:
     factor, contrast, blur = given
     bits, is_corner = _detected(lit, kind, number(threshold * factor), number(contrast))
     corners = dr.compress(is_corner)
-    return _blended(lit, bits, corners, number(blur)) if len(corners) else lit.light
+    return _blended(lit, bits, corners, number(blur)) if dr.width(corners) else lit.light
 
 
 # Passes are recorded once and replayed: to trace them for each frame takes longer than some do.

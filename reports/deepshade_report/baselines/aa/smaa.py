@@ -74,7 +74,7 @@ def _shade(lit: Lit, kind: str, threshold: float, steps: int, diagonal: int, *gi
     factor, contrast, rounding = given
     edges = _detected(lit, kind, number(threshold * factor), number(contrast))
     where = dr.compress(edges != 0)
-    if not len(where):
+    if not dr.width(where):
         return lit.light
     counts = dr.opaque(mi.Int32, steps), dr.opaque(mi.Int32, diagonal)
     return _blended(lit, edges, where, diagonal_areas(), *counts, number(1 - rounding))

@@ -18,8 +18,7 @@ from typing import Any
 import drjit as dr
 
 from deepshade_report.baselines.gi.lit import Lit, open_lit
-from deepshade_report.baselines.picture import Filter
-from deepshade_report.baselines.screen import mi
+from deepshade_report.baselines.picture import Filter, mi
 from deepshade_report.tuning import Ranges, Tunable, tuned
 from deepshade_workers.sampling import pixel_streams, random_pair, strata
 

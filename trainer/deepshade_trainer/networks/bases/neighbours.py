@@ -48,7 +48,7 @@ class Neighbours(Bases):
         image, total = light, torch.ones_like(light[:, :1])
         # As rows of pixels: an engine that holds a pixel's channels together then puts each plane
         # in one piece, all at once, where its split of channels is slow.
-        shares = torch.exp((weights + _START).clamp(max=12.0)).flatten(2).split(1, 1)
+        shares = torch.split(torch.exp((weights + _START).clamp(max=12.0)).flatten(2), 1, 1)
         for (down, right), each in zip(_AROUND, shares, strict=True):
             rows, columns = slice(1 + down, 1 + down + height), slice(1 + right, 1 + right + width)
             share = each.reshape(count, 1, height, width)
