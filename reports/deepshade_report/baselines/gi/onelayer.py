@@ -23,8 +23,8 @@ from deepshade_report.tuning import Ranges, Tunable, tuned
 from deepshade_workers.sampling import pixel_streams, random_pair, strata
 
 # rays a pixel, as `strata` rounds them
-SETTINGS = (32, 128, 512)
-QUICK = (32,)
+SETTINGS = (16, 64)
+QUICK = (16,)
 # Rays end before the eye, at this share of their origin's depth.
 _NEAREST = 0.02
 
