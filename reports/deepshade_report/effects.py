@@ -34,8 +34,8 @@ class Figures:
     """What was measured of one effect, sorted by who is compared.
 
     `ours` are our networks where they run by default, `first` of them the one that rivals are held
-    against; `paper` is the paper's on the same engine, in the same precision. `rivals` maps each
-    to its setting of least error and the best one that takes no longer than `first`.
+    against; `paper` is the paper's, and `alike` our first on its engine, in its precision. `rivals`
+    maps each to its setting of least error and the best one that takes no longer than `first`.
 
     Raises DataError: no error or speed of ours was measured, with the reason.
     """
@@ -54,8 +54,16 @@ class Figures:
         # the first that was measured is on the backend that the rule chooses
         self.ours = list({point.name: point for point in reversed(mine)}.values())[::-1]
         self.first = next((p for p in self.ours if p.name == DEFAULT), self.ours[-1])
-        beside = (p for p in found if p.family == PAPER_NETWORK and p.backend == self.first.backend)
-        self.paper = next(beside, None)
+        # on its own default backend: 8 bits, ours often, are not for it
+        self.paper = next((p for p in found if p.family == PAPER_NETWORK), None)
+        self.alike = next(
+            (
+                p
+                for p in mine
+                if self.paper and (p.name, p.backend) == (self.first.name, self.paper.backend)
+            ),
+            None,
+        )
         self.rivals: dict[str, tuple[Point, Point | None]] = {}
         others = [point for point in found if point.family not in (NETWORK, PAPER_NETWORK)]
         for name in dict.fromkeys(point.name for point in others):
@@ -88,6 +96,8 @@ def table(found: Figures) -> list[str]:
     lines += [_line(f"**`{point.name}`**", point, point.backend) for point in found.ours]
     if found.paper:
         lines.append(_line("the paper's network, our recipe", found.paper, found.paper.backend))
+        if found.alike and found.alike not in found.ours:
+            lines.append(_line(f"`{found.alike.name}`, alike", found.alike, found.alike.backend))
     for name, (best, quick) in found.rivals.items():
         lines.append(_line(name, best, _setting(best)))
         if quick is None:
@@ -104,13 +114,13 @@ def overview(found: dict[str, Figures]) -> list[str]:
     """Markdown: a line for each effect, errors as shares of the trivial answer's."""
     lines = [
         "| | views | doing nothing, DSSIM | ours | best rival | rival in our time "
-        "| the paper's network | ours, ms | the paper's, ms | best rival, ms |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| the paper's network | ours, ms | the paper's, ms | ours alike, ms | best rival, ms |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for effect, each in found.items():
         others = (each.rival, each.quick, each.paper)
         shares = [f"{100 * p.of_trivial:.1f} %" if p else "-" for p in (each.first, *others)]
-        times = [_ms(p) if p else "-" for p in (each.first, each.paper, each.rival)]
+        times = [_ms(p) if p else "-" for p in (each.first, each.paper, each.alike, each.rival)]
         facts = [str(each.error["views"]), _short(each.error["trivial_dssim"])]
         title = f"[{EFFECTS[effect].title}](#{effect})"
         lines.append(f"| {' | '.join([title, *facts, *shares, *times])} |")

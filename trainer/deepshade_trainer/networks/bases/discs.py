@@ -112,17 +112,17 @@ class Discs(Bases):
         # rest: what is sharp over all, the least blurred over what is two radii on.
         # Through what reaches into the focus nothing shows, but through a wide near surface.
         wide = torch.maximum((reach / _RADII[0] - 1).clamp(0, 1), self.far) * cover
-        share = F.conv2d(wide, self.open, self.before)
-        layers, under = mild * share, share - F.conv2d(mild, self.over)
+        opening = F.conv2d(wide, self.open, self.before)
+        layers, under = mild * opening, opening - F.conv2d(mild, self.over)
         for k, size in enumerate(_RADII[1:], 1):
             spread = getattr(self, f"disc{size:g}")
             if size > _HALF:
                 strong = strong + _spread(F.avg_pool2d(layer(k), 2), spread)
                 continue
             more = _spread(layer(k), spread)
-            layers = layers + more * (share if k == 1 else under.clamp(_CLOSED, 1))
+            layers = layers + more * (opening if k == 1 else under.clamp(_CLOSED, 1))
             mild = mild + more
-        under = share - F.conv2d(mild, self.over)
+        under = opening - F.conv2d(mild, self.over)
         layers = layers + _twice(strong) * under.clamp(_CLOSED, 1)
         # What a near surface hides.
         other = light * (1 + focal * (0.5 / _RADII[0])).clamp(0, 1)
