@@ -15,6 +15,7 @@ from deepshade.environments import (
     world_to_map,
 )
 from deepshade.errors import DamagedImageError, EnvironmentMapError, ImageError, LimitError
+from deepshade_workers import backend
 
 RANDOM = np.random.default_rng(11)
 
@@ -95,14 +96,12 @@ def test_a_world_that_is_z_up():
 
 
 def test_hdr_files_as_mitsuba_reads_them(tmp_path):
-    import mitsuba
-
-    mitsuba.set_variant("scalar_rgb")
+    bitmap = backend.mitsuba().Bitmap
     smooth = np.repeat(RANDOM.gamma(0.5, size=(3, 16, 8)), 4, axis=2).astype(np.float32)
     smooth[:, 3, 5] = 0
     path = tmp_path / "map.hdr"
-    mitsuba.Bitmap(np.ascontiguousarray(smooth.transpose(1, 2, 0))).write(str(path))
-    theirs = np.array(mitsuba.Bitmap(str(path))).transpose(2, 0, 1)
+    bitmap(np.ascontiguousarray(smooth.transpose(1, 2, 0))).write(str(path))
+    theirs = np.array(bitmap(str(path))).transpose(2, 0, 1)
     ours = read_environment(path)
     assert ours.name == "map"
     np.testing.assert_array_equal(ours.radiance, theirs)

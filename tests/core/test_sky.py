@@ -5,6 +5,7 @@ import pytest
 
 from deepshade.environments import directions, sky, solid_angles
 from deepshade.errors import ConfigError
+from deepshade_workers import backend
 
 
 @pytest.mark.parametrize(("elevation", "azimuth"), [(35, 40), (10, 179.9), (89, -120), (2, 0)])
@@ -40,9 +41,7 @@ def test_a_low_sun_is_red_and_a_high_one_much_brighter_than_the_sky():
 @pytest.mark.parametrize(("elevation", "turbidity"), [(60, 2.5), (35, 3)])
 def test_the_sky_goes_with_mitsubas(elevation, turbidity):
     """Theirs is another model (Hosek and Wilkie's), so only what both must have is asked."""
-    import mitsuba
-
-    mitsuba.set_variant("llvm_ad_rgb")
+    mitsuba = backend.mitsuba()
     made = sky(elevation=elevation, azimuth=0, turbidity=turbidity, height=32)
     angle = np.radians(elevation)
     towards = [0.0, -float(np.cos(angle)), float(np.sin(angle))]  # theirs is z up

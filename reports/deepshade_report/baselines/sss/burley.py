@@ -86,7 +86,10 @@ def _shade(
     surface, packed = frame
     numbers = [dr.opaque(mi.Float, value) for value in (width, small)]
     image = _gather(surface, packed, _spiral(taps), dr.opaque(mi.UInt32, taps), *numbers)
-    image = smoothed(surface.screen, image, blur, edge)
+    if blur:  # nor may what doesn't scatter lend light here
+        scatters = dr.select(surface.free > 0, mi.Color3f(1), 0)
+        image = smoothed(surface.screen, image * scatters, blur, edge)
+        image /= dr.maximum(smoothed(surface.screen, scatters, blur, edge), TINY)
     return dr.select(surface.free > 0, image, surface.light)
 
 

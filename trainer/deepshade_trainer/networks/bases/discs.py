@@ -142,8 +142,9 @@ class Discs(Bases):
         total = near * gains[0] + far * (left * gains[1]) + hidden * (left * gains[2])
         left, total, colour = torch.split(_twice(torch.cat([left, total], 1)), [1, 1, 3], 1)
         # nowhere 0: where nothing else is, there is what is faint
-        smooth = colour / total
-        return smooth + (light - smooth) * ((1 - blurred).clamp_min(0) * left)
+        sharp = (1 - blurred).clamp_min(0) * left
+        # Not as a difference: beside a light of 1e5 nothing would be left of what is dark.
+        return colour / total * (1 - sharp) + light * sharp
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
