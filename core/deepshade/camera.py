@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from deepshade.errors import CameraError
 
+_STRIDE = 4  # every how many pixels normals are compared
+_FLAT = 1e-3  # share of a singular value that is rounding
 Window = tuple[int, int, int, int]
 # attribute -> (shape, least value)
 _PLACING: dict[str, tuple[tuple[int, ...], float | None]] = {
@@ -213,6 +215,32 @@ def rotation_of(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     u, _, vt = np.linalg.svd(matrix[:3, :3])
     return np.asarray(u @ vt, np.float64)
+
+
+def camera_to_world(
+    attributes: Mapping[str, NDArray[np.floating[Any]]], camera: Camera | None = None
+) -> NDArray[np.float64]:
+    """The (3, 3) that turns camera space into the world, which a left-handed world mirrors.
+
+    As `attributes` "normal" and "normal_world" (3, H, W) have it where they are given and point
+    more than one way, else as `camera` has it; without either, what fits them. (The nearest
+    orthogonal matrix: Schönemann, "A Generalized Solution of the Orthogonal Procrustes Problem",
+    1966.)
+    """
+    matrix = camera.world_to_camera if camera is not None else None
+    moment = np.zeros((3, 3))
+    if {"normal", "normal_world"} <= attributes.keys():
+        seen, there = (
+            np.asarray(attributes[name][:, ::_STRIDE, ::_STRIDE], np.float64).reshape(3, -1)
+            for name in ("normal", "normal_world")
+        )
+        moment = there @ seen.T
+    u, size, vt = np.linalg.svd(moment)
+    if size[1] <= _FLAT * size[0] and matrix is not None:
+        return rotation_of(matrix).T
+    if size[2] <= _FLAT * size[0]:  # of one plane's directions: which way the third, isn't said
+        u[:, 2] *= np.sign(np.linalg.det(u @ vt))
+    return np.asarray(u @ vt)
 
 
 def _checked_matrix(matrix: ArrayLike) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from deepshade import exr, pictures, tensors
 from deepshade.bundles import Bundle
+from deepshade.camera import camera_to_world
 from deepshade.effects import EFFECTS, SETTINGS, Setting
 from deepshade.engines import Engine
 from deepshade.environments import Prepared
@@ -209,7 +210,8 @@ def lit(
 ) -> ShadePlan:
     """The plan with its lighting: the world's up axis is the one asked for, else the renderer's."""
     lighting = Lighting(prepared.environment, asked.rotate or 0.0, asked.up or gbuffer.up)
-    given = prepared.inputs(bundle.environment, lighting.rotate, lighting.up)
+    camera = camera_to_world(gbuffer.attributes, gbuffer.camera)
+    given = prepared.inputs(bundle.environment, lighting.rotate, lighting.up, camera)
     return replace(plan, lighting=lighting, given=given)
 
 

@@ -145,10 +145,10 @@ def test_visibility_and_a_smooth_map_give_directional_occlusion(
     corner: Scene, above: Camera
 ) -> None:
     view = under(smooth(), above, rotation=50.0)
-    channels, visibility = layer_of("do_visibility")
+    layer = layer_of("do_visibility")
     hits = trace(corner, above, SIDE, SIDE)
-    found, spread = visibility(corner, view, hits, {}, samples=256, seed=1)
-    assert found.shape == (channels, SIDE, SIDE)
+    found, spread = layer.render(corner, view, hits, {}, samples=256, seed=1)
+    assert found.shape == (layer.channels, SIDE, SIDE)
     occlusion, also = rendered(ao, corner, view, seed=2)
     assert_within(found[0] * np.sqrt(4 * np.pi), np.hypot(spread[0] * 3.55, also[0]), occlusion[0])
     light = projected(

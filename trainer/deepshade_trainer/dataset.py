@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from torch import Tensor
 
-from deepshade import symmetry, tensors
+from deepshade import judging, symmetry, tensors
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.environments import Prepared
@@ -142,33 +142,47 @@ class Dataset:
         given = self.effect, sample, self.effect.inputs, radius
         return tensors.tensor(*given, per_channel=self.per_channel, multiple=multiple)
 
-    def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, ...]:
         """G-buffers (N, C, H, W) and references (N, outputs, H, W) to learn from.
 
         Each sample is turned by one of the effect's symmetries; some have 16-bit lengths, some
         directions that are too short; networks run per channel see one colour channel.
         """
+        drawn = [self._drawn(number, rng) for number in numbers]
+        return tuple(torch.from_numpy(np.stack(each)) for each in zip(*drawn, strict=True))
+
+    def _drawn(self, number: int, rng: np.random.Generator) -> tuple[NDArray[np.float32], ...]:
+        sample = self.load(number)
+        turn = self.effect.symmetries[int(rng.integers(len(self.effect.symmetries)))]
+        reference = symmetry.apply(sample[self.reference], None, turn)
+        gbuffer, channel = self._seen(number, sample, turn, rng)
+        return gbuffer, reference if channel is None else reference[channel : channel + 1]
+
+    def _seen(
+        self, number: int, sample: Sample, turn: int, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float32], int | None]:
+        """A sample's G-buffer (C, H, W), turned and with its flaws, and which colour it is of."""
         effect = self.effect
-        inputs, references = [], []
-        for number in numbers:
-            sample = self.load(number)
-            turn = effect.symmetries[int(rng.integers(len(effect.symmetries)))]
-            turned = {
-                name: symmetry.apply(plane, None if name == self.reference else name, turn)
-                for name, plane in sample.items()
-            }
-            if rng.random() < HALF_LENGTHS:
-                turned |= {name: rounded(turned[name]) for name in lengths(effect.inputs)}
-            if rng.random() < SHORT_DIRECTIONS:
-                turned |= shortened(turned, directions(effect.inputs), MIN_DIRECTION, rng)
-            channel = int(rng.integers(3)) if self.per_channel else None
-            scale = tensors.length_scale(effect, turned, self.radius(number))
-            planes = tensors.planes(turned, effect.inputs, scale, channel=channel)
-            height, width = turned[self.reference].shape[1:]
-            inputs.append(tensors.cut(planes, (0, height, 0, width))[0])
-            some = slice(None) if channel is None else slice(channel, channel + 1)
-            references.append(turned[self.reference][some])
-        return torch.from_numpy(np.stack(inputs)), torch.from_numpy(np.stack(references))
+        turned = {name: symmetry.apply(sample[name], name, turn) for name in self.attributes}
+        if rng.random() < HALF_LENGTHS:
+            turned |= {name: rounded(turned[name]) for name in lengths(effect.inputs)}
+        if rng.random() < SHORT_DIRECTIONS:
+            turned |= shortened(turned, directions(effect.inputs), MIN_DIRECTION, rng)
+        channel = int(rng.integers(3)) if self.per_channel else None
+        scale = tensors.length_scale(effect, turned, self.radius(number))
+        planes = tensors.planes(turned, effect.inputs, scale, channel=channel)
+        height, width = planes[0].pixels.shape
+        return tensors.cut(planes, (0, height, 0, width))[0], channel
+
+    def judged(self, number: int) -> tuple[Tensor, tuple[Tensor, ...], Sample]:
+        """What networks are validated on.
+
+        A G-buffer (N, C, H, W), what else the network is given, and the sample: attributes, the
+        reference and the answer of doing nothing ("trivial"), all (C, H, W).
+        """
+        sample = self.load(number)
+        sample["trivial"] = judging.trivial(self.effect, sample, sample[self.reference])
+        return torch.from_numpy(self.gbuffer(sample, self.radius(number))), (), sample
 
 
 @lru_cache(maxsize=2)
@@ -212,6 +226,7 @@ class Batch:
     numbers: list[int]
     gbuffer: Tensor
     reference: Tensor
+    light: tuple[Tensor, ...] = ()  # what else `Shader.lit` takes
 
 
 def batches(
@@ -232,7 +247,8 @@ def batches(
                     return
                 chosen = _chosen(numbers, size, seed, step)
                 rng = np.random.default_rng([seed, step, 1])
-                queue.put(Batch(step, chosen, *data.batch(chosen, rng)))
+                gbuffer, reference, *light = data.batch(chosen, rng)
+                queue.put(Batch(step, chosen, gbuffer, reference, tuple(light)))
         except BaseException as error:  # handed to the training loop
             queue.put(error)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from deepshade import judging, metrics, pictures
 from deepshade.bundles import Bundle
+from deepshade.camera import camera_to_world
 from deepshade.effects import Effect
 from deepshade.engines import REFERENCE, Backend, load_engine
 from deepshade.environments import Prepared
@@ -85,7 +86,8 @@ class Shaded:
         gbuffer = data.gbuffer(sample, radius, self.bundle.size_multiple)
         if self.bundle.environment and lit is None:
             raise DataError(f"the samples have no environment, which {self.bundle.name} needs")
-        given = lit[0].inputs(self.bundle.environment, lit[1], "y") if lit else {}
+        camera = camera_to_world(sample)
+        given = lit[0].inputs(self.bundle.environment, lit[1], "y", camera) if lit else {}
         shaded: Image = self.engine.predict(gbuffer, given)
         return shaded.reshape(-1, *shaded.shape[2:])[:, :height, :width]
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from deepshade.bundles import CONFIG, MODEL, Bundle, write_config
 from deepshade.effects import EFFECTS
+from deepshade.environments import Prepared, sky
 from deepshade.errors import DataError
 from deepshade.files import replacing
 from deepshade.tensors import up
@@ -72,6 +73,7 @@ def export(
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).unlink(missing_ok=True)  # no bundle while its graph changes
     graph = write_onnx(shader, folder / MODEL)
+    given = some_light(shader)
     worst = parity(shader, folder / MODEL, held)
     if not worst <= TOLERANCE:
         raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
@@ -94,12 +96,13 @@ def export(
             )
             for name, place in shader.places.items()
         },
-        "bytes_per_pixel": bytes_per_pixel(graph, INPUT, (shader.channels, side, side)),
+        "bytes_per_pixel": bytes_per_pixel(graph, INPUT, (shader.channels, side, side), given),
         "per_channel": shader.per_channel,
         "float32": float32,
         "float32_after": after,
-        "int8": int8_ranges(graph, INPUT, [each.numpy() for each in trained], rounded),
+        "int8": int8_ranges(graph, INPUT, [each.numpy() for each in trained], rounded, given),
         "network": asdict(recipe.network),
+        **({"environment": list(given)} if given else {}),
         "input_name": INPUT,
         "output_name": OUTPUT,
     }
@@ -135,7 +138,10 @@ def write_onnx(shader: Shader, path: Path) -> Any:
     shader = deepcopy(shader).eval()
     shader.network.prepare_export()
     side = 2 * shader.size_multiple
-    free = {0: "batch", 2: "height", 3: "width"}
+    given = some_light(shader)
+    free = {2: "height", 3: "width"}
+    if not given:
+        free[0] = "batch"
     with TemporaryDirectory() as scratch, replacing(path) as temporary:
         raw = Path(scratch) / MODEL
         with quiet(), torch.inference_mode():
@@ -143,9 +149,9 @@ def write_onnx(shader: Shader, path: Path) -> Any:
             register("aten::expm1", _expm1, OPSET)
             torch.onnx.export(
                 shader,
-                (torch.zeros(1, shader.channels, side, side),),
+                (torch.zeros(1, shader.channels, side, side), *map(torch.from_numpy, given.values())),
                 str(raw),
-                input_names=[INPUT],
+                input_names=[INPUT, *given],
                 output_names=[OUTPUT],
                 dynamic_axes={INPUT: free, OUTPUT: free},
                 opset_version=OPSET,
@@ -162,16 +168,24 @@ def write_onnx(shader: Shader, path: Path) -> Any:
     return model
 
 
+def some_light(shader: Shader) -> dict[str, NDArray[np.float32]]:
+    """What the graph takes of an environment, if it does: that of a sky, askew."""
+    if not shader.network.environment:
+        return {}
+    camera = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    return Prepared.of(sky(height=64)).inputs(shader.network.environment, 30.0, "y", camera)
+
+
 def parity(shader: Shader, path: Path, pictures: Sequence[Tensor]) -> float:
     """Largest difference between ONNX Runtime (CPU, fp32) and torch, of values over 1 relative."""
     import onnxruntime as ort
 
     session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    worst = 0.0
+    given, worst = some_light(shader), 0.0
     with torch.inference_mode():
         for gbuffer in pictures:
-            ours: NDArray[np.float32] = session.run(None, {INPUT: gbuffer.numpy()})[0]
-            theirs = shader(gbuffer).numpy()
+            ours: NDArray[np.float32] = session.run(None, {INPUT: gbuffer.numpy(), **given})[0]
+            theirs = shader(gbuffer, *map(torch.from_numpy, given.values())).numpy()
             difference = np.abs(ours - theirs) / np.maximum(1, np.abs(theirs))
             worst = max(worst, float(difference.max()))
     return worst

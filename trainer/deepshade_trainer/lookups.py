@@ -10,12 +10,13 @@ import torch
 
 from deepshade.bundles import MODEL, Bundle, write_config
 from deepshade.effects import EFFECTS
-from deepshade.environments import INPUTS, Prepared, sky, world_to_map
+from deepshade.environments import Prepared, sky, world_to_map
 from deepshade.errors import DataError
 from deepshade_trainer.export import INPUT, OPSET, OUTPUT, TOLERANCE, quiet
 from deepshade_trainer.graph import bytes_per_pixel, fold_constants
 from deepshade_trainer.networks.reflections import ATTRIBUTES, Reflections
 
+GIVEN = ("lobes", "turn")  # of an environment
 _SIDE = 96  # of the picture that parity is proven on
 
 
@@ -29,8 +30,8 @@ def export_reflections(folder: Path, lobes: int = 1) -> tuple[Bundle, float]:
     shader = Reflections(lobes).eval()
     folder.mkdir(parents=True, exist_ok=True)
     given = [torch.from_numpy(picture(_SIDE))]
-    lit = Prepared.of(sky(height=64)).inputs(INPUTS, 30.0, "y")
-    given += [torch.from_numpy(lit[name]) for name in INPUTS]
+    lit = Prepared.of(sky(height=64)).inputs(GIVEN, 30.0, "y")
+    given += [torch.from_numpy(lit[name]) for name in GIVEN]
     free = {2: "height", 3: "width"}
     with TemporaryDirectory() as scratch, quiet(), torch.inference_mode():
         raw = Path(scratch) / MODEL
@@ -38,7 +39,7 @@ def export_reflections(folder: Path, lobes: int = 1) -> tuple[Bundle, float]:
             shader,
             tuple(given),
             str(raw),
-            input_names=[INPUT, *INPUTS],
+            input_names=[INPUT, *GIVEN],
             output_names=[OUTPUT],
             dynamic_axes={INPUT: free, OUTPUT: free},
             opset_version=OPSET,
@@ -49,7 +50,7 @@ def export_reflections(folder: Path, lobes: int = 1) -> tuple[Bundle, float]:
     if not worst <= TOLERANCE:
         raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
     channels = given[0].shape[1]
-    further = {name: tensor.numpy() for name, tensor in zip(INPUTS, given[1:], strict=True)}
+    further = {name: tensor.numpy() for name, tensor in zip(GIVEN, given[1:], strict=True)}
     config = {
         "effect": effect.name,
         "name": folder.name,
@@ -62,7 +63,7 @@ def export_reflections(folder: Path, lobes: int = 1) -> tuple[Bundle, float]:
         "bytes_per_pixel": bytes_per_pixel(graph, INPUT, (channels, 256, 256), further),
         "float32": [OUTPUT],
         "network": {"kind": "reflections", "lobes": lobes},
-        "environment": list(INPUTS),
+        "environment": list(GIVEN),
         "input_name": INPUT,
         "output_name": OUTPUT,
     }

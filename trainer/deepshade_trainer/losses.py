@@ -32,10 +32,10 @@ def dssim(image: Tensor, reference: Tensor) -> Tensor:
     Images smaller than a window are one window. Values are first made relative to the
     reference's mean, so that little cancels in a window's E[x²] - E[x]².
     """
-    window = [min(WINDOW, side) for side in image.shape[-2:]]
+    high, wide = (min(WINDOW, side) for side in image.shape[-2:])
 
     def mean(x: Tensor) -> Tensor:
-        return F.avg_pool2d(x, window, stride=1)
+        return _summed(_summed(x, high, 2), wide, 3) * (1 / (high * wide))
 
     x, y = image.float(), reference.float()
     center = y.mean((2, 3), keepdim=True)
@@ -47,6 +47,17 @@ def dssim(image: Tensor, reference: Tensor) -> Tensor:
     ax, ay = mx + center, my + center
     ssim = (2 * ax * ay + C1) * (2 * cov + C2) / ((ax**2 + ay**2 + C1) * (vx + vy + C2))
     return (1 - ssim.mean()) / 2
+
+
+def _summed(x: Tensor, count: int, axis: int) -> Tensor:
+    """Sums of `count` neighbours along an axis, by halves: far quicker than pooling."""
+    if count == 1:
+        return x
+    half = count // 2
+    sums = _summed(x, half, axis)
+    length = x.shape[axis] - count + 1
+    found = sums.narrow(axis, 0, length) + sums.narrow(axis, half, length)
+    return found + x.narrow(axis, count - 1, length) if count % 2 else found
 
 
 LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "dssim": dssim}

@@ -130,6 +130,9 @@ def _channels(effect: Effect, kind: str) -> dict[str, Any]:
         "outputs": 1 if per_channel else len(effect.outputs),
     }
     places = channel_slices(effect.inputs, per_channel)
-    if kind == "fold" and effect.lengths == "radius" and {"normal", "position"} <= places.keys():
+    geometric = effect.lengths == "radius" and {"normal", "position"} <= places.keys()
+    if kind in ("fold", "openings") and geometric:
         found |= {name: places[name].start for name in ("normal", "position")}
+    if kind == "openings" and "normal_world" in places:
+        found["world"] = places["normal_world"].start
     return found

@@ -22,6 +22,7 @@ from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing
 from deepshade_trainer.dataset import Batch, Dataset, batches
+from deepshade_trainer.lit import Lit
 from deepshade_trainer.losses import dssim, parse_loss
 from deepshade_trainer.networks import Network, Shader, build, bundle_weights
 from deepshade_trainer.recipe import Recipe
@@ -70,11 +71,13 @@ class _Trainer:
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.shader = Shader(EFFECTS[recipe.effect], self.network)
         runs = self.shader.per_channel
-        self.data = (
-            Dataset(folders, recipe.effect, per_channel=runs)
-            if self.device.type == "cpu"
-            else Resident(folders, recipe.effect, per_channel=runs, device=self.device)
-        )
+        self.data: Dataset
+        if self.network.environment:
+            self.data = Lit(folders, recipe.effect, self.network.towards.numpy(force=True))
+        elif self.device.type == "cpu":
+            self.data = Dataset(folders, recipe.effect, per_channel=runs)
+        else:
+            self.data = Resident(folders, recipe.effect, per_channel=runs, device=self.device)
         self.training, held = self.data.split(recipe.val_fraction, seed=recipe.seed)
         if len(self.training) < recipe.batch:
             raise DataError(
@@ -94,13 +97,12 @@ class _Trainer:
         step = max(1, len(held) // (2 * VALIDATION_SAMPLES))
         found = []
         for number in held[::step]:
-            sample = self.data.load(number)
+            _, _, sample = self.data.judged(number)
             if not all(np.isfinite(plane).all() for plane in sample.values()):
                 self.warnings.append(f"not validated on: {self.data.entries[number].name}")
                 continue
-            reference = sample[self.data.reference]
-            blank = judging.trivial(effect, sample, reference)
-            if judging.contrast(effect, reference, blank) >= effect.min_contrast:
+            shown = judging.contrast(effect, sample[self.data.reference], sample["trivial"])
+            if shown >= effect.min_contrast:
                 found.append(number)
         if not found and self.recipe.val_fraction:
             self.warnings.append(
@@ -138,6 +140,8 @@ class _Trainer:
         else:
             raise ConfigError("init_from", detail=f"{folder} is no run to start from, nor a bundle")
         own = self.network.state_dict()
+        # a network may have as a part of it what another is
+        weights = {f"trunk.{k}": w for k, w in weights.items()} | weights
         known = {k: w for k, w in weights.items() if k in own and own[k].shape == w.shape}
         if not known:
             raise ConfigError(
@@ -198,10 +202,9 @@ class _Trainer:
             return math.nan, "non-finite samples"
         self.shader.train()
         mixed = recipe.precision == "bf16"
+        given = [each.to(self.device) for each in batch.light]
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
-            image = self.shader.on_curve(self.shader.padded(gbuffer))
-        height, width = reference.shape[2:]
-        image = image[:, :, :height, :width]
+            image = self._answered(self.shader, gbuffer, given)
         loss = self.loss(*self.shader.compared(image, reference))
         self.optimizer.zero_grad(set_to_none=True)
         if not torch.isfinite(loss):
@@ -221,6 +224,14 @@ class _Trainer:
                 self.average[name].lerp_(value, 1 - decay)
         return float(loss.detach()), ""
 
+    @staticmethod
+    def _answered(shader: Shader, gbuffer: Tensor, given: Sequence[Tensor]) -> Tensor:
+        """The answer on the transfer curve, as large as the G-buffer."""
+        height, width = gbuffer.shape[2:]
+        padded = shader.padded(gbuffer)
+        image = shader.lit(padded, *given) if given else shader.on_curve(padded)
+        return image[:, :, :height, :width]
+
     def _validate(self, log: Any, step: int) -> dict[str, float]:
         """Mean DSSIM and MAE of the averaged weights, beside the trivial answer's DSSIM."""
         effect = self.data.effect
@@ -230,13 +241,12 @@ class _Trainer:
         rows: list[list[float]] = []
         pictures: list[Tensor] = []
         for number in self.held:
-            sample = self.data.load(number)
-            gbuffer = torch.from_numpy(self.data.gbuffer(sample, self.data.radius(number)))
+            gbuffer, light, sample = self.data.judged(number)
+            given = [each.to(self.device) for each in light]
             with torch.inference_mode():
-                answer = shader(shader.padded(gbuffer.to(self.device))).cpu().flatten(0, 1).numpy()
-            reference = sample[self.data.reference]
-            answer = answer[:, : reference.shape[1], : reference.shape[2]]
-            blank = judging.trivial(effect, sample, reference)
+                found = shader.bounded(self._answered(shader, gbuffer.to(self.device), given))
+            answer = found.cpu().flatten(0, 1).numpy()
+            reference, blank = sample[self.data.reference], sample["trivial"]
             image, truth, nothing = (
                 torch.from_numpy(each)[None]
                 for each in judging.exposed(effect, reference, answer, reference, blank)

@@ -43,15 +43,16 @@ def render_sample(
             needs a setting of the view.
         SceneError: the view moves an object that the scene doesn't have.
     """
-    references = {effect: reference_of(effect) for effect in effects}
+    references: dict[str, Any] = {effect: reference_of(effect) for effect in effects}
     names = {*attributes, *(name for effect in references for name in EFFECTS[effect].inputs)}
-    references |= {layer: layer_of(layer)[1] for layer in layers}
+    references |= {layer: layer_of(layer).render for layer in layers}
     hits = trace(scene, view.camera, width, height)
     images = make_attributes(scene, view, hits, names, seed=seed, samples=samples)
     for name, reference in references.items():
         value, error = reference(scene, view, hits, images, samples=samples, seed=seed)
         images[f"reference_{name}"] = value
-        images[f"reference_{name}_error"] = error
+        if error is not None:
+            images[f"reference_{name}_error"] = error
     return images
 
 
@@ -131,9 +132,9 @@ def channels_of(
         outputs = EFFECTS[effect].outputs
         suffixes[effect] = ("V",) if len(outputs) == 1 else outputs
     for layer in layers:
-        suffixes[layer] = [f"{index:02d}" for index in range(layer_of(layer)[0])]
+        suffixes[layer] = [f"{index:02d}" for index in range(layer_of(layer).channels)]
     for name, ends in suffixes.items():
         for layer in (f"reference_{name}", f"reference_{name}_error"):
-            for end, plane in zip(ends, images[layer], strict=True):
+            for end, plane in zip(ends, images.get(layer, ()), strict=layer in images):
                 found[f"{layer}.{end}"] = plane
     return found

@@ -29,10 +29,10 @@ def schema(
             tensors[attribute.name] = {"dtype": attribute.unit.storage, "shape": shape}
         for name in (f"reference_{row.name}", f"reference_{row.name}_error"):
             tensors[name] = {"dtype": row.storage, "shape": [len(row.outputs), size, size]}
-    for layer in layers:
-        channels, _ = layer_of(layer)
-        for name in (f"reference_{layer}", f"reference_{layer}_error"):
-            tensors[name] = {"dtype": "float16", "shape": [channels, size, size]}
+    for name in layers:
+        layer = layer_of(name)
+        for full in (f"reference_{name}",) + (() if layer.exact else (f"reference_{name}_error",)):
+            tensors[full] = {"dtype": layer.storage, "shape": [layer.channels, size, size]}
     return tensors
 
 

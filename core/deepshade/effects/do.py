@@ -9,7 +9,6 @@ EFFECT = Effect(
     ("normal_world", "normal", "position"),
     "(1/π)∫ V_R L_env cosθ dω; equals ao under a white environment",
     lengths="radius",
-    background=1.0,
     trivial=1.0,
     settings=("radius", "environment"),
     symmetries=ROTATIONS,

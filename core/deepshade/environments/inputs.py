@@ -17,6 +17,7 @@ Float = NDArray[np.float32]
 INPUTS: dict[str, tuple[int, ...]] = {
     "lobes": (1, 3, HEIGHT, WIDTH),  # `lobes.prefilter`
     "turn": (3, 3),  # `world_to_map`
+    "camera": (3, 3),  # the same of camera space
 }
 
 
@@ -38,10 +39,20 @@ class Prepared:
         tables = sum(table.nbytes for table in self.tables.values())
         return tables + self.environment.radiance.nbytes
 
-    def inputs(self, names: Iterable[str], degrees: float, up: Up) -> dict[str, Float]:
-        """The inputs of those names, for a world that is `up` up and a map turned by `degrees`."""
-        turn = {"turn": world_to_map(degrees, up).astype(np.float32)}
-        known = {**self.tables, **turn}
+    def inputs(
+        self,
+        names: Iterable[str],
+        degrees: float,
+        up: Up,
+        camera: NDArray[np.floating] | None = None,
+    ) -> dict[str, Float]:
+        """The inputs of those names, for a world that is `up` up and a map turned by `degrees`.
+
+        `camera` (3, 3) turns camera space into the world (`camera.camera_to_world`).
+        """
+        turn = world_to_map(degrees, up)
+        turns = {"turn": turn, "camera": turn if camera is None else turn @ camera}
+        known = {**self.tables, **{name: each.astype(np.float32) for name, each in turns.items()}}
         return {name: known[name] for name in names}
 
 

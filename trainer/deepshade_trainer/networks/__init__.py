@@ -17,6 +17,7 @@ from deepshade_trainer.networks.carrier import Carrier, CarrierConfig
 from deepshade_trainer.networks.chain import Chain, ChainConfig
 from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet
 from deepshade_trainer.networks.network import Network
+from deepshade_trainer.networks.openings import Openings, OpeningsConfig
 from deepshade_trainer.networks.paper_unet import PaperConfig, PaperUNet
 from deepshade_trainer.networks.shader import Shader
 
@@ -31,12 +32,13 @@ __all__ = [
     "network_config",
 ]
 
-NetworkConfig = CarrierConfig | ChainConfig | FoldConfig | PaperConfig
+NetworkConfig = CarrierConfig | ChainConfig | FoldConfig | OpeningsConfig | PaperConfig
 
 _KINDS: dict[str, tuple[Any, Any]] = {
     "carrier": (CarrierConfig, Carrier),
     "chain": (ChainConfig, Chain),
     "fold": (FoldConfig, FoldUNet),
+    "openings": (OpeningsConfig, Openings),
     "paper": (PaperConfig, PaperUNet),
 }
 

@@ -116,6 +116,17 @@ class FoldUNet(Network):
 
     def forward(self, gbuffer: Tensor) -> Tensor:
         """See `Network.forward`."""
+        return self.pixels(self.cells(gbuffer))
+
+    def pixels(self, x: Tensor) -> Tensor:
+        """The outputs (N, outputs, H, W), float32, of what `cells` made of a G-buffer."""
+        # bf16 has only 1/256 between 0.5 and 1, where most of an occlusion image lies.
+        with full_precision():
+            x = self.head(x.to(self.head.weight.dtype)).float()  # (N, outputs fold², h, w)
+            return F.pixel_shuffle(x, self.config.fold)
+
+    def cells(self, gbuffer: Tensor) -> Tensor:
+        """All but the last convolution: (N, C, H, W) to (N, widths[0], H / fold, W / fold)."""
         config = self.config
         x = self._stem(gbuffer)  # (N, widths[0], H / fold, W / fold)
         told: list[Tensor] = []
@@ -137,10 +148,7 @@ class FoldUNet(Network):
         for n in reversed(range(len(self.decode))):
             x = F.relu(skips[n] + self.upsample[n](x))  # (N, widths[n], step h, step w)
             x = self.decode[n](x, masks[n])
-        # bf16 has only 1/256 between 0.5 and 1, where most of an occlusion image lies.
-        with full_precision():
-            x = self.head(x.to(self.head.weight.dtype)).float()  # (N, outputs fold², h, w)
-            return F.pixel_shuffle(x, config.fold)  # (N, outputs, H, W)
+        return x
 
     def _stem(self, gbuffer: Tensor) -> Tensor:
         """All but positions, folded: (N, C, H, W) to (N, widths[0], H / fold, W / fold)."""

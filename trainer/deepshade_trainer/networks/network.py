@@ -25,6 +25,8 @@ class Network(nn.Module, ABC):
     # Convolutions may be calculated in 16 and 8 bits where their weights' names begin so. If only
     # some may, all that doesn't lie between those is calculated in float32.
     rounded = ""
+    # What it is given of an environment beside the G-buffer: names in `environments.INPUTS`.
+    environment: tuple[str, ...] = ()
 
     @property
     @abstractmethod
@@ -36,8 +38,8 @@ class Network(nn.Module, ABC):
         """The input columns that the output column `pixel` depends on (rows are alike)."""
 
     @abstractmethod
-    def forward(self, gbuffer: Tensor) -> Tensor:
-        """(N, C, H, W) to (N, outputs, H, W)."""
+    def forward(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
+        """(N, C, H, W), and what `environment` names, to (N, outputs, H, W)."""
 
     @property
     def halo(self) -> int:

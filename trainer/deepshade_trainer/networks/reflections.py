@@ -107,6 +107,25 @@ class Reflections(nn.Module):
         return _sampled(table, x, y, align_corners=False)
 
 
+def blurred(table: Tensor, directions: Tensor, level: int) -> Tensor:
+    """A(d, 2^level) (1, 3, H, W) for `directions` (1, 3, H, W) of the map, of any length but 0."""
+    tile, (u, v) = TILES[1 + level], _angles(directions)
+    x = (tile.column + 2 * tile.rows * u) * (2 / WIDTH) - 1
+    y = (tile.row + tile.rows * v) * (2 / HEIGHT) - 1
+    return _sampled(table, x, y, align_corners=False)
+
+
+def mean(table: Tensor) -> Tensor:
+    """(1, 3, 1, 1): the map's mean."""
+    tile = TILES[0]
+    return table[:, :, tile.row : tile.row + 1, tile.column : tile.column + 1]
+
+
+def turned(vectors: Tensor, turn: Tensor) -> Tensor:
+    """`vectors` (1, 3, H, W) by a (3, 3) matrix."""
+    return _turned(vectors, turn)
+
+
 def _sampled(picture: Tensor, x: Tensor, y: Tensor, *, align_corners: bool) -> Tensor:
     """Bilinear samples (1, C, H, W) of (1, C, h, w) at x and y (1, 1, H, W) in [-1, 1]."""
     grid = torch.cat([x, y], dim=1).permute(0, 2, 3, 1)  # much quicker than to stack them last

@@ -58,9 +58,16 @@ class Shader(nn.Module):
         """See `Network.halo`."""
         return self.network.halo
 
-    def forward(self, gbuffer: Tensor) -> Tensor:
-        """(N, C, H, W) to the answer (N, outputs, H, W), float32, in physical units."""
-        image: Tensor = transfer.inverse(self.on_curve(gbuffer), self.transfer, torch)
+    def forward(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
+        """(N, C, H, W) to the answer (N, outputs, H, W), float32, in physical units.
+
+        `given` is what the network needs of an environment (`Network.environment`).
+        """
+        return self.bounded(self.on_curve(gbuffer, *given))
+
+    def bounded(self, answer: Tensor) -> Tensor:
+        """What `on_curve` gave in physical units, and in evaluation mode within the range."""
+        image: Tensor = transfer.inverse(answer, self.transfer, torch)
         unbounded = self.training or self.effect.range == (None, None)
         return image if unbounded else image.clamp(*self.effect.range)
 
@@ -82,12 +89,19 @@ class Shader(nn.Module):
         ]
         return torch.cat(pieces, 1)
 
-    def on_curve(self, gbuffer: Tensor) -> Tensor:
+    def on_curve(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
         """(N, C, H, W) to the answer on the transfer curve (N, outputs, H, W): what is learnt."""
-        image: Tensor = self.network(self._seen(gbuffer)).float()
+        image: Tensor = self.network(self._seen(gbuffer), *given).float()
         if self.background is None:
             return image
         return (image - self.background) * self._coverage(gbuffer) + self.background
+
+    def lit(self, gbuffer: Tensor, irradiance: Tensor, through: Tensor) -> Tensor:
+        """As `on_curve` (N J, 3, H, W), under J maps at once: see `Openings.lit`."""
+        more = [now - before for now, before in zip(gbuffer.shape[2:], irradiance.shape[2:], strict=True)]
+        irradiance = F.pad(irradiance, (0, more[1], 0, more[0]), "replicate")
+        image: Tensor = self.network.lit(gbuffer, irradiance, through)
+        return image.reshape(-1, 3, *image.shape[2:])
 
     def curve(self, image: Tensor) -> Tensor:
         """Light or answers through the transfer curve."""
@@ -103,7 +117,7 @@ class Shader(nn.Module):
         if not self.effect.is_light:
             return image, self.curve(reference)
         image = transfer.inverse(image, self.transfer, torch)
-        flat = reference.flatten(1)
+        flat = reference[:, :, ::2, ::2].flatten(1)  # plenty, and sorting takes long
         white = torch.quantile(flat, 0.99, dim=1)
         white = torch.where(white > _BLACK, white, flat.amax(1).clamp_min(_BLACK))
         factor = (1 / white)[:, None, None, None]

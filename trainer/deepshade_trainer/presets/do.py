@@ -3,6 +3,6 @@
 from deepshade_trainer.presets.paper import PAPER
 
 PRESETS = {
-    "balanced": {},
+    "balanced": {"network": {"kind": "openings"}, "batch": 4, "steps": 4000},
     "paper": {**PAPER, "network": {"kind": "paper", "u0": 16, "levels": 5}},
 }

@@ -8,13 +8,13 @@ were made of them, at least the effect's inputs. `samples` are per pixel; the sa
 same noise. Both results are planar (C, H, W) float32 with the effect's outputs as channels.
 
 A file may also define `LAYERS`: what networks may learn from beside the reference, made on request.
-Each is a function like `reference` by its name, with the number of its channels; the whole is asked
-for as `<effect>_<name>`.
+Each is a `Layer` by its name; the whole is asked for as `<effect>_<name>`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from importlib import import_module
 from pkgutil import iter_modules
 
@@ -22,6 +22,19 @@ from deepshade.errors import ConfigError
 from deepshade_workers.view import Image
 
 Reference = Callable[..., tuple[Image, Image]]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """What may be rendered beside a reference: a function like one, and what it gives.
+
+    `storage` is the type that holds the (channels, H, W) in a shard. What is exact has no error.
+    """
+
+    channels: int
+    render: Callable[..., tuple[Image, Image | None]]
+    storage: str = "float16"
+    exact: bool = False
 
 
 def known() -> tuple[str, ...]:
@@ -39,15 +52,15 @@ def require(effects: Iterable[str]) -> None:
             )
 
 
-def layers_of(effect: str) -> dict[str, tuple[int, Reference]]:
-    """What may be asked for beside the reference of `effect`: (channels, function) by full name."""
+def layers_of(effect: str) -> dict[str, Layer]:
+    """What may be asked for beside the reference of `effect`, by full name."""
     module = import_module(f"{__name__}.{effect}")
-    found: dict[str, tuple[int, Reference]] = getattr(module, "LAYERS", {})
+    found: dict[str, Layer] = getattr(module, "LAYERS", {})
     return {f"{effect}_{name}": layer for name, layer in found.items()}
 
 
-def layer_of(name: str) -> tuple[int, Reference]:
-    """Channels and function of the layer `name`; ConfigError if no effect has it."""
+def layer_of(name: str) -> Layer:
+    """The layer `name`; ConfigError if no effect has it."""
     there = {full: layer for effect in known() for full, layer in layers_of(effect).items()}
     if name not in there:
         raise ConfigError(name, there, detail=f"no layer {name!r}; there are: {', '.join(there)}")

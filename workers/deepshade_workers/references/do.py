@@ -1,7 +1,8 @@
 """Directional occlusion: the environment's light that nothing within a radius blocks.
 
 Also visibility itself, whatever the light (`visibility`): its product with a smooth map's spherical
-harmonics is the reference under that map.
+harmonics is the reference under that map. And which of many fixed directions are open
+(`directions`): the reference under any map made of as many distant lamps, without noise.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import numpy as np
 
 from deepshade.camera import rotation_of
 from deepshade.environments.harmonics import COUNT, harmonics
+from deepshade.environments.lamps import DIRECTIONS
 from deepshade_workers.backend import mitsuba
 from deepshade_workers.environments import light_of
+from deepshade_workers.references import Layer
 from deepshade_workers.sampling import split, stratified_mean
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, offset_origin
@@ -97,4 +100,30 @@ def visibility(
     return value, error
 
 
-LAYERS = {"visibility": (COUNT, visibility)}
+def directions(
+    scene: Scene, view: View, hits: Hits, images: Images, *, samples: int, seed: int
+) -> tuple[Image, None]:
+    """Which of `deepshade.environments.lamps.DIRECTIONS`, in camera space, nothing blocks within R.
+
+    Returns (64, H, W): 8 directions a plane, the first in the highest bit (as `np.unpackbits` takes
+    them), 0 to 255. Those below a pixel's horizon count as blocked, and so do all of background.
+    """
+    origin = offset_origin(hits.p, hits.ng, scene)
+    reach = dr.opaque(mi.Float, view.radius)
+    planes = []
+    for eight in (DIRECTIONS @ rotation_of(view.camera.matrix)).reshape(-1, 8, 3):
+        bits = mi.UInt32(0)
+        for direction in eight:
+            toward = mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in direction))
+            valid = hits.valid & (dr.dot(toward, hits.ns) > 0)
+            ray = mi.Ray3f(origin, toward, reach, 0.0, [])
+            valid &= ~scene.traced.ray_test(ray, valid)
+            bits = 2 * bits + dr.select(valid, mi.UInt32(1), mi.UInt32(0))
+        planes.append(np.asarray(bits.numpy(), np.float32))
+    return np.stack(planes).reshape(-1, hits.height, hits.width), None
+
+
+LAYERS = {
+    "visibility": Layer(COUNT, visibility),
+    "directions": Layer(len(DIRECTIONS) // 8, directions, "uint8", exact=True),
+}

@@ -1,0 +1,169 @@
+"""Our network for light from all around: geometry decides what is open to each direction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from deepshade.environments.lamps import fibonacci
+from deepshade.errors import ConfigError
+from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
+from deepshade_trainer.networks.horizons import covered, unit
+from deepshade_trainer.networks.network import Network, check_types
+from deepshade_trainer.networks.receptive_field import Span
+from deepshade_trainer.networks.reflections import blurred, mean, turned
+
+LEVEL = 5  # the map is seen through lobes of exponent 2^LEVEL
+_HALVES = 4  # vectors are found for 2 x 2 parts of a cell
+_SURFACE = 0.25  # the square of a normal's length; background has none
+
+
+@dataclass(frozen=True)
+class OpeningsConfig:
+    """The shape of the trunk (`FoldConfig`), and of what it tells.
+
+    `features` of a cell say what is open, in as many `directions`. `world`, `normal` and `position`
+    are the first of three channels of the G-buffer each: the normal in world space and in camera
+    space, and the position.
+    """
+
+    kind: str = "openings"
+    inputs: int = 9
+    outputs: int = 3
+    features: int = 64
+    directions: int = 96
+    widths: tuple[int, ...] = (48, 96, 128)
+    steps: tuple[int, ...] = (4, 2)
+    down: tuple[int, ...] = (1, 2, 2)
+    up: tuple[int, ...] = (2, 2)
+    fold: int = 4
+    rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
+    fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
+    detail: tuple[int, ...] = (1, 1)
+    bias: float = 0.85
+    world: int | None = 0
+    normal: int | None = 3
+    position: int | None = 6
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError where entries don't fit each other."""
+        check_types(self)
+        for name in ("features", "directions"):
+            if getattr(self, name) < 1:
+                raise ConfigError(name, detail=f"{name} must be 1 or more")
+        if self.fold % 2 or None in (self.world, self.normal, self.position):
+            raise ConfigError("network", detail="it needs both normals, positions, an even fold")
+        _ = self.trunk
+
+    @property
+    def trunk(self) -> FoldConfig:
+        """The network that ambient occlusion has too."""
+        names = ("widths", "steps", "down", "up", "fold", "rings", "fine_rings", "detail", "bias")
+        shared: dict[str, Any] = {name: getattr(self, name) for name in names}
+        return FoldConfig(inputs=6, outputs=1, normal=0, position=3, **shared)
+
+
+class Openings(Network):
+    """Light from all around (N, 3, H, W) where a surface lies open to it:
+
+        ao I(N) + Σ_k (r_k + N·v_k) (E_k - Ē)
+
+    I is the irradiance over π of the open surface, looked up; E_k is the map through a lobe about
+    the k-th of many directions in camera space, and Ē their mean. The trunk gives ao, and features
+    from which r_k and v_k are made linearly. So the sum over k is done first, on the weights, and
+    costs nothing however many there are; the answer is linear in the map; and under a white one it
+    is ao. Where there is no surface stands the map's mean.
+    """
+
+    linear = True
+    rounded = "trunk."
+    environment = ("lobes", "turn", "camera")
+    towards: Tensor
+
+    def __init__(self, config: OpeningsConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.trunk = _Trunk(config)
+        planes = 3 * _HALVES + config.fold**2
+        weights = torch.randn(config.directions, planes, config.features)
+        self.weights = nn.Parameter(weights * 0.02)
+        towards = torch.from_numpy(fibonacci(config.directions).T).float()
+        self.register_buffer("towards", towards[None, :, None], persistent=False)
+
+    @property
+    def size_multiple(self) -> int:
+        """See `Network.size_multiple`."""
+        return self.trunk.size_multiple
+
+    def receptive_field(self, pixel: int) -> Span:
+        """See `Network.receptive_field`."""
+        return self.trunk.receptive_field(pixel)
+
+    def forward(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
+        """(1, 9, H, W), the table of `environments.lobes`, the turns from world and from camera to
+        the map (3, 3), to (1, 3, H, W)."""
+        lobes, turn, camera = given
+        with full_precision():
+            start = self.config.world or 0
+            normal = gbuffer[:, start : start + 3]
+            seen = blurred(lobes, turned(normal, turn), 0)
+            around = mean(lobes)
+            surface = (normal * normal).sum(1, keepdim=True) > _SURFACE
+            surface = surface & (self._covered(gbuffer) > 0)
+            irradiance = torch.where(surface, seen, around)
+            through = blurred(lobes, turned(self.towards, camera), LEVEL)  # (1, 3, 1, K)
+        return self.lit(gbuffer, irradiance, through[:, :, 0])
+
+    def lit(self, gbuffer: Tensor, irradiance: Tensor, through: Tensor) -> Tensor:
+        """(N, C, H, W) for a G-buffer under C / 3 maps at once.
+
+        `irradiance` (N, C, H, W) is that of the open surface, over π, and of background the map's
+        mean; `through` (N, C, directions) the maps in camera space, through lobes.
+        """
+        config = self.config
+        starts = config.normal or 0, config.position or 0
+        six = torch.cat([gbuffer[:, at : at + 3] for at in starts], 1)
+        occlusion, features = self.trunk(six)
+        with full_precision():
+            count, colours, _ = through.shape
+            high, wide = features.shape[2:]
+            planes, width = self.weights.shape[1:]
+            # divided, so that weights are learnt at the pace of all others
+            contrast = (through - through.mean(2, keepdim=True)) * (1 / width)
+            weights = contrast @ self.weights.flatten(1)  # (N, C, planes * features)
+            weights = weights.reshape(count, colours * planes, width)
+            told = weights @ features.float().flatten(2)
+            told = told.reshape(count * colours, planes, high, wide)
+            vectors = F.pixel_shuffle(told[:, : 3 * _HALVES], 2)  # (N C, 3, 2h, 2w)
+            vectors = F.interpolate(vectors, scale_factor=config.fold / 2, mode="nearest")
+            rest = F.pixel_shuffle(told[:, 3 * _HALVES :], config.fold)
+            normal = unit(six[:, :3])
+            size = normal.shape[2:]
+            vectors = vectors.reshape(count, colours, 3, *size)
+            learnt = (vectors * normal[:, None]).sum(2) + rest.reshape(count, colours, *size)
+            inside = covered(six[:, 5:])
+            return irradiance + inside * ((occlusion - 1) * irradiance + learnt)
+
+    def _covered(self, gbuffer: Tensor) -> Tensor:
+        last = (self.config.position or 0) + 2
+        return covered(gbuffer[:, last : last + 1])
+
+    def prepare_export(self) -> None:
+        """See `Network.prepare_export`."""
+        self.trunk.prepare_export()
+
+
+class _Trunk(FoldUNet):
+    """Ambient occlusion (N, 1, H, W), and features (N, features, h, w) of each cell."""
+
+    def __init__(self, config: OpeningsConfig) -> None:
+        super().__init__(config.trunk)
+        self.tells = nn.Conv2d(config.widths[0], config.features, 3, padding=1)
+
+    def forward(self, gbuffer: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        x = self.cells(gbuffer)
+        return self.pixels(x), F.relu(self.tells(x))
