@@ -149,7 +149,10 @@ def write_onnx(shader: Shader, path: Path) -> Any:
             register("aten::expm1", _expm1, OPSET)
             torch.onnx.export(
                 shader,
-                (torch.zeros(1, shader.channels, side, side), *map(torch.from_numpy, given.values())),
+                (
+                    torch.zeros(1, shader.channels, side, side),
+                    *map(torch.from_numpy, given.values()),
+                ),
                 str(raw),
                 input_names=[INPUT, *given],
                 output_names=[OUTPUT],

@@ -153,10 +153,10 @@ def int8_ranges(
 ) -> dict[str, tuple[float, float]]:
     """The ranges of what convolutions that may run in 8 bits convolve, by their weights' names.
 
-    `pictures` (N, C, H, W) go through the input `name`, beside the `further` inputs. Of the convolutions whose weights' names
-    begin with `rounded`, the first stay in float, and so do the last two on the way to the picture:
-    8 bits there would show, as bands and as noise on even surfaces (without the last but one 2.2 %
-    more DSSIM became 0.7 %).
+    `pictures` (N, C, H, W) go through the input `name`, beside the `further` inputs. Of the
+    convolutions whose weights' names begin with `rounded`, the first stay in float, and so do the
+    last two on the way to the picture: 8 bits there would show, as bands and as noise on even
+    surfaces (without the last but one 2.2 % more DSSIM became 0.7 %).
     """
     import onnx
     import onnxruntime as ort
@@ -176,7 +176,9 @@ def int8_ranges(
     session = ort.InferenceSession(watched.SerializeToString(), providers=["CPUExecutionProvider"])
     low, high = dict.fromkeys(names, 0.0), dict.fromkeys(names, 1e-6)
     for picture in pictures:
-        for each, value in zip(names, session.run(names, {name: picture, **(further or {})}), strict=True):
+        for each, value in zip(
+            names, session.run(names, {name: picture, **(further or {})}), strict=True
+        ):
             low[each] = min(low[each], float(value.min()))
             high[each] = max(high[each], float(value.max()))
     return {node.input[1]: (low[node.input[0]], high[node.input[0]]) for node in inner}

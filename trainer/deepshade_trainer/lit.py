@@ -117,8 +117,7 @@ class Lit(Dataset):
         A direction's light is the radiance of the solid angle that it stands for.
         """
         entry = self.entries[number]
-        packed = self._open[entry.path].get_slice(self.layer)  # `load` has opened it
-        packed = packed[entry.index, :, *part]
+        packed = self._file(number).get_slice(self.layer)[entry.index, :, *part]
         normal = torch.from_numpy(np.ascontiguousarray(normals))
         flux = torch.from_numpy((light * (4 / _COUNT)).astype(np.float32))  # over π
         toward = torch.from_numpy(DIRECTIONS).float()
@@ -176,7 +175,7 @@ def _lamps_of(folder: Path, digest: str) -> tuple[Any, Any]:
 def _looked_up(table: Tensor, normal: Tensor) -> Tensor:
     """(C, H, W): a latitude-longitude `table` (1, C, h, 2 h) at the directions (3, H, W)."""
     x, y, z = normal
-    height, width = table.shape[2:]
+    width = table.shape[3]
     wide = F.pad(table, (1, 1, 0, 0), "circular")
     u = (torch.atan2(x, -z) / (2 * math.pi) + 0.5) * width + 1
     v = torch.atan2(torch.hypot(x, z), y) / math.pi

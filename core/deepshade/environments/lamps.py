@@ -55,7 +55,7 @@ def _cells(height: int, width: int, count: int) -> tuple[Float64, Float64, NDArr
 
 
 def nearest(directions: Float64, points: Float64) -> NDArray[np.intp]:
-    """(N,): which of the unit `points` (M, 3) is nearest to each of the unit `directions` (N, 3)."""
+    """(N,): which of the unit `points` (M, 3) is nearest to each unit direction (N, 3)."""
     columns = points.T.astype(np.float32)
     blocks = [directions[k : k + _ROWS] for k in range(0, len(directions), _ROWS)]
     return np.concatenate([(block.astype(np.float32) @ columns).argmax(1) for block in blocks])

@@ -55,8 +55,13 @@ class OpeningsConfig:
         for name in ("features", "directions"):
             if getattr(self, name) < 1:
                 raise ConfigError(name, detail=f"{name} must be 1 or more")
-        if self.fold % 2 or None in (self.world, self.normal, self.position):
-            raise ConfigError("network", detail="it needs both normals, positions, an even fold")
+        if self.fold % 2 or self.world is None:
+            raise ConfigError("fold", detail="it needs normals of the world and an even fold")
+        if self.normal is None or (self.normal + 3, self.normal + 6) != (
+            self.position,
+            self.inputs,
+        ):
+            raise ConfigError("position", detail="positions come last, after normals")
         _ = self.trunk
 
     @property
@@ -125,9 +130,8 @@ class Openings(Network):
         mean; `through` (N, C, directions) the maps in camera space, through lobes.
         """
         config = self.config
-        starts = config.normal or 0, config.position or 0
-        six = torch.cat([gbuffer[:, at : at + 3] for at in starts], 1)
-        occlusion, features = self.trunk(six)
+        first = config.normal or 0
+        occlusion, features = self.trunk(gbuffer, first)
         with full_precision():
             count, colours, _ = through.shape
             high, wide = features.shape[2:]
@@ -141,11 +145,11 @@ class Openings(Network):
             vectors = F.pixel_shuffle(told[:, : 3 * _HALVES], 2)  # (N C, 3, 2h, 2w)
             vectors = F.interpolate(vectors, scale_factor=config.fold / 2, mode="nearest")
             rest = F.pixel_shuffle(told[:, 3 * _HALVES :], config.fold)
-            normal = unit(six[:, :3])
+            normal = unit(gbuffer[:, first : first + 3])
             size = normal.shape[2:]
             vectors = vectors.reshape(count, colours, 3, *size)
             learnt = (vectors * normal[:, None]).sum(2) + rest.reshape(count, colours, *size)
-            inside = covered(six[:, 5:])
+            inside = self._covered(gbuffer)
             return irradiance + inside * ((occlusion - 1) * irradiance + learnt)
 
     def _covered(self, gbuffer: Tensor) -> Tensor:
@@ -164,6 +168,8 @@ class _Trunk(FoldUNet):
         super().__init__(config.trunk)
         self.tells = nn.Conv2d(config.widths[0], config.features, 3, padding=1)
 
-    def forward(self, gbuffer: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        x = self.cells(gbuffer)
+    def forward(  # type: ignore[override]
+        self, gbuffer: Tensor, first: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        x = self.cells(gbuffer, first)
         return self.pixels(x), F.relu(self.tells(x))

@@ -83,7 +83,7 @@ class Shader(nn.Module):
             F.pad(
                 gbuffer[:, place],
                 (0, width, 0, height),
-                "replicate" if ATTRIBUTES[name].in_background else "constant",
+                "replicate" if ATTRIBUTES[name].goes_on else "constant",
             )
             for name, place in self.places.items()
         ]
@@ -98,7 +98,10 @@ class Shader(nn.Module):
 
     def lit(self, gbuffer: Tensor, irradiance: Tensor, through: Tensor) -> Tensor:
         """As `on_curve` (N J, 3, H, W), under J maps at once: see `Openings.lit`."""
-        more = [now - before for now, before in zip(gbuffer.shape[2:], irradiance.shape[2:], strict=True)]
+        more = [
+            now - before
+            for now, before in zip(gbuffer.shape[2:], irradiance.shape[2:], strict=True)
+        ]
         irradiance = F.pad(irradiance, (0, more[1], 0, more[0]), "replicate")
         image: Tensor = self.network.lit(gbuffer, irradiance, through)
         return image.reshape(-1, 3, *image.shape[2:])
