@@ -17,8 +17,10 @@ import torch
 from deepshade import exr, judging, metrics, tensors
 from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.bundles import Bundle
+from deepshade.camera import camera_to_world
 from deepshade.effects import EFFECTS
 from deepshade.engines import Backend, Engine, available, load_engine
+from deepshade.environments import Prepared, sky
 from deepshade.gbuffer import GBuffer
 from deepshade_service import shading
 from deepshade_service.config import Settings
@@ -131,8 +133,12 @@ def test_a_served_answer_is_the_networks(models: Path, local: Local, effect: str
     runs = range(3) if bundle.per_channel else (None,)
     planes = [tensors.planes(inputs, bundle.inputs, scale, channel=run) for run in runs]
     given = np.concatenate([tensors.cut(each, (0, rows, 0, columns)) for each in planes])
+    light = Prepared.of(sky(height=512)) if bundle.environment else None
+    more = light.inputs(bundle.environment, 0.0, "y", camera_to_world(inputs)) if light else {}
     with torch.inference_mode():
-        expected = from_bundle(bundle.path)(torch.from_numpy(given)).flatten(0, 1).numpy()
+        shader = from_bundle(bundle.path)
+        answered = shader(*map(torch.from_numpy, (given, *more.values())))
+    expected = answered.flatten(0, 1).numpy()
     expected = expected[:, :HEIGHT, :WIDTH].clip(*EFFECTS[effect].range)
     background = EFFECTS[effect].background
     if background == "light":

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepshade import exr
-from deepshade.camera import Camera, matrix_from_header, rotation_of
+from deepshade.camera import Camera, camera_to_world, matrix_from_header, rotation_of
 from deepshade.errors import CameraError
 
 
@@ -115,3 +115,44 @@ def test_position_from_depth_has_that_depth():
     depth = np.array([[1.0, 2.0], [np.inf, 4.0]], np.float32)
     position = Camera(50, 2, 2).position_from_depth(depth)
     np.testing.assert_array_equal(-position[2], depth)
+
+
+def turned(seed, mirror=1.0):
+    """A random orthogonal matrix of that determinant."""
+    matrix = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    matrix[0] *= mirror * np.sign(np.linalg.det(matrix))
+    return matrix
+
+
+def normals(directions, turn):
+    """Attributes of a picture of 16 x 24 that shows these directions (N, 3), and nothing."""
+    seen = np.zeros((3, 16, 24), np.float32)
+    chosen = np.arange(16 * 20) % 7 % len(directions)
+    seen[:, :, :20] = np.asarray(directions)[chosen].T.reshape(3, 16, 20)
+    there = np.tensordot(turn, seen, 1).astype(np.float32)
+    return {"normal": seen, "normal_world": there * np.float32(0.9)}
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_two_normals_of_a_pixel_tell_how_the_camera_is_turned(mirror):
+    """A world that is left-handed too; the file's own matrix is not asked."""
+    turn = turned(1, mirror)
+    other = Camera.look_at((1, 2, 3), (0, 0, 0), (0, 1, 0), 50, 24, 16)
+    found = camera_to_world(normals(np.eye(3), turn), other)
+    np.testing.assert_allclose(found, turn, atol=1e-6)
+
+
+def test_of_a_floor_and_a_wall_the_third_axis_follows():
+    found = camera_to_world(normals(np.eye(3)[:2], turned(2)))
+    np.testing.assert_allclose(found, turned(2), atol=1e-6)
+
+
+def test_a_flat_wall_leaves_it_to_the_matrix():
+    camera = Camera.look_at((1, 2, 3), (0, 0, 0), (0, 1, 0), 50, 24, 16)
+    wall = normals([(0, 0.6, 0.8)], turned(3))
+    found = camera_to_world(wall, camera)
+    np.testing.assert_allclose(found, rotation_of(camera.matrix).T, atol=1e-12)
+    alone = camera_to_world(wall)
+    np.testing.assert_allclose(alone @ [0, 0.6, 0.8], turned(3) @ [0, 0.6, 0.8], atol=1e-6)
+    np.testing.assert_allclose(alone @ alone.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(camera_to_world({}, camera), rotation_of(camera.matrix).T)

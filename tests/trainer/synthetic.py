@@ -24,6 +24,7 @@ SIZE = 64
 RADIUS = 0.5
 # What a fold network of a few thousand parameters is, instead of a preset's million.
 TRUNK: dict[str, Any] = {"widths": (8, 12), "steps": (2,), "down": (1, 1), "up": (1,)}
+OPENINGS = TRUNK | {"features": 8, "directions": 12}
 SMALL = TRUNK | {"rings": (1,), "fine_rings": (1, 2), "detail": ()}
 
 
@@ -70,6 +71,11 @@ def reference(effect: str, inputs: dict[str, Any], seed: int) -> Any:
     return image.astype(row.storage)
 
 
+def opening(seed: int) -> Any:
+    """(64, SIZE, SIZE) bytes: which of 512 directions are open, at random."""
+    return np.random.default_rng([seed, 2]).integers(0, 256, (64, SIZE, SIZE), np.uint8)
+
+
 def write_data(folder: Path, effect: str, count: int = 8) -> Path:
     """A data folder of one shard with `count` views of as many scenes."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -80,13 +86,16 @@ def write_data(folder: Path, effect: str, count: int = 8) -> Path:
         sample = {**inputs, f"reference_{effect}": answer}
         if (beside := EFFECTS[effect].trivial_layer) is not None:
             sample.setdefault(beside, answer[::-1] / 2)  # with something to show beside the answer
+        if "environment" in EFFECTS[effect].settings:
+            sample[f"reference_{effect}_directions"] = opening(seed)
         samples.append(sample)
     schema = {
         name: {"dtype": str(v.dtype), "shape": list(v.shape)} for name, v in samples[0].items()
     }
     content = save({name: np.stack([sample[name] for sample in samples]) for name in schema})
     (folder / "shard-00000.safetensors").write_bytes(content)
-    record: dict[str, Any] = {"radius": RADIUS, "camera": {}}
+    camera = {"world_to_camera": np.eye(4).tolist()}
+    record: dict[str, Any] = {"radius": RADIUS, "camera": camera}
     if "environment" in EFFECTS[effect].settings:
         white = Environment("white", np.ones((3, 8, 16), np.float32))
         store(folder, white)
@@ -100,7 +109,7 @@ def write_data(folder: Path, effect: str, count: int = 8) -> Path:
 def small(effect: str, name: str) -> Recipe:
     """A preset, its network small if it is ours, for one step of two views."""
     recipe = preset(name, effect).changed(steps=1, batch=2, val_fraction=0.2, precision="fp32")
-    shape = {"fold": SMALL, "carrier": TRUNK}.get(recipe.network.kind, {})
+    shape = {"fold": SMALL, "carrier": TRUNK, "openings": OPENINGS}.get(recipe.network.kind, {})
     return recipe.changed(network=shape)
 
 

@@ -15,7 +15,7 @@ from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.evaluation import evaluate
-from deepshade_trainer.export import load_shader
+from deepshade_trainer.export import load_shader, some_light
 from deepshade_trainer.networks import Shader, build, from_bundle
 from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
@@ -105,9 +105,11 @@ def test_every_effect_trains_and_exports(effect: str, name: str, tmp_path: Path)
         multiple=bundle.size_multiple,
     )
     session = ort.InferenceSession(str(bundle.model), providers=["CPUExecutionProvider"])
-    (shade,) = session.run([bundle.output_name], {bundle.input_name: gbuffer})
+    light = some_light(after)
+    assert tuple(light) == bundle.environment
+    (shade,) = session.run([bundle.output_name], {bundle.input_name: gbuffer, **light})
     with torch.inference_mode():
-        expected = after(torch.from_numpy(gbuffer)).numpy()
+        expected = after(*map(torch.from_numpy, (gbuffer, *light.values()))).numpy()
     # what is summed up from bright light may cancel: rounding is relative to the brightest
     size = np.abs(expected).max() if before.linear else np.abs(expected)
     assert (np.abs(shade - expected) <= 1e-5 * np.maximum(1, size)).all()
@@ -157,8 +159,8 @@ def test_what_is_learnt_is_the_answer_on_its_curve(effect: str) -> None:
         per_channel=shader.per_channel,
         multiple=shader.size_multiple,
     )
-    image = shader.on_curve(torch.from_numpy(gbuffer))
-    answer = shader(torch.from_numpy(gbuffer))
+    given = [*map(torch.from_numpy, (gbuffer, *some_light(shader).values()))]
+    image, answer = shader.on_curve(*given), shader(*given)
     assert torch.isfinite(answer).all()
     expected = torch.expm1(image) if shader.transfer == "log" else image
     # beyond expm1's slope at 80 float32 ends

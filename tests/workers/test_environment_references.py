@@ -11,6 +11,7 @@ import pytest
 from deepshade.camera import Camera, rotation_of
 from deepshade.environments import Environment, directions, solid_angles, world_to_map
 from deepshade.environments.harmonics import harmonics, projected
+from deepshade.environments.lamps import DIRECTIONS
 from deepshade.errors import ConfigError
 from deepshade_workers.environments import EnvironmentLight
 from deepshade_workers.references import ao, do, full, ibl, layer_of
@@ -159,6 +160,30 @@ def test_visibility_and_a_smooth_map_give_directional_occlusion(
     product = np.einsum("ck,khw->chw", light, found)
     assert np.abs(product - value).mean() < 0.01 * value.std() + 3 * error.mean()
     assert value.std() > 10 * np.abs(product - value).mean()
+
+
+def test_open_directions_add_up_to_directional_occlusion(corner: Scene, above: Camera) -> None:
+    """Under as many lamps: ambient occlusion where all are alike, and exactly a single one."""
+    view, hits = under(filled(), above), trace(corner, above, SIDE, SIDE)
+    layer = layer_of("do_directions")
+    found, error = layer.render(corner, view, hits, {}, samples=1, seed=0)
+    assert error is None
+    assert found.shape == (layer.channels, SIDE, SIDE)
+    open_ = np.unpackbits(found.astype(np.uint8), axis=0).reshape(len(DIRECTIONS), -1)
+    seen = rotation_of(above.matrix) @ hits.ns.numpy().astype(np.float64)
+    cosines = DIRECTIONS @ seen
+    assert not open_[cosines < -1e-6].any()
+    occlusion, _ = rendered(ao, corner, view, samples=1024)
+    total = (open_ * cosines).sum(0) / np.maximum(cosines, 0).sum(0)
+    assert total == pytest.approx(occlusion.ravel(), abs=0.05)
+    assert (total - occlusion.ravel()).mean() == pytest.approx(0, abs=0.005)
+    # The wall, endless, ends at a radius of 1: what is nearer than that stops a ray towards it.
+    x, y, z = hits.p.numpy()
+    floor, toward = y < 1e-3, (rotation_of(above.matrix).T @ DIRECTIONS.T)
+    for k in np.flatnonzero(toward[1] > 0.3)[::7]:
+        far = (z + 1) / np.maximum(-toward[2, k], 1e-9)  # along the ray to the wall
+        clear = np.abs(far - 1) > 1e-3
+        assert (open_[k] == (far > 1))[floor & clear].all()
 
 
 def test_background_is_the_maps_mean(ahead: Camera) -> None:

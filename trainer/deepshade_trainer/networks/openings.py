@@ -57,11 +57,8 @@ class OpeningsConfig:
                 raise ConfigError(name, detail=f"{name} must be 1 or more")
         if self.fold % 2 or self.world is None:
             raise ConfigError("fold", detail="it needs normals of the world and an even fold")
-        if self.normal is None or (self.normal + 3, self.normal + 6) != (
-            self.position,
-            self.inputs,
-        ):
-            raise ConfigError("position", detail="positions come last, after normals")
+        if self.normal is None or self.normal + 3 != self.position:
+            raise ConfigError("position", detail="positions must follow normals")
         _ = self.trunk
 
     @property
