@@ -1,4 +1,4 @@
-"""Light from all around: what holds for any weights, what is learnt from, and the shipped bundle."""
+"""Light from all around: what holds for any weights, what is learnt from, the shipped bundle."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_several_maps_at_once_are_each_alone() -> None:
 def samples(tmp_path_factory: pytest.TempPathFactory) -> Lit:
     """Noise, as data."""
     folder = write_data(tmp_path_factory.mktemp("lit"), "do", 2)
-    return Lit([folder], "do", network().towards.numpy())
+    return Lit([folder], "do", network().towards.numpy(), 4)
 
 
 def test_samples_are_relit_as_a_sum_over_their_open_directions(samples: Lit) -> None:
@@ -128,6 +128,26 @@ def test_samples_are_relit_as_a_sum_over_their_open_directions(samples: Lit) -> 
     for image in samples._relit(0, sample["normal"][:, *sky], light, sky):
         mean = np.broadcast_to(light.mean(0)[:, None, None], image.shape)
         assert image == pytest.approx(mean, rel=1e-5)
+
+
+def test_the_error_of_what_is_open_is_that_under_each_lamp_alone(samples: Lit) -> None:
+    """The answer to each of some lamps of radiance 1, against open or not."""
+    made = network().train()
+    gbuffer, _, irradiance, through, *probe = samples.batch([1], np.random.default_rng(6))
+    at, open_, towards, shares = (part[0] for part in probe)
+    image, error = made.learnt(gbuffer, irradiance, through, [(at, open_, towards, shares)])
+    assert torch.allclose(image, made.lit(gbuffer, irradiance, through))
+    cells = gbuffer[:, :, at[0] :: 4, at[1] :: 4]
+    normal = cells[0, 3:6] / cells[0, 3:6].norm(dim=0).clamp_min(1e-6)
+    whole = gbuffer[0, 3:6] / gbuffer[0, 3:6].norm(dim=0).clamp_min(1e-6)
+    squares = []
+    for k in range(0, 512, 37):
+        lamp = torch.einsum("d,dhw->hw", towards[k], whole).clamp_min(0)
+        alone = made.lit(gbuffer, lamp[None, None] / 128, shares[None, None, :, k])
+        cosine = torch.einsum("d,dhw->hw", towards[k], normal).clamp_min(0)
+        seen = alone[0, 0, at[0] :: 4, at[1] :: 4] * 128 - open_[k] * cosine
+        squares.append(float((seen * (cells[0, 8] < 0)).square().mean().detach()))
+    assert np.mean(squares) == pytest.approx(float(error.detach()), rel=0.15)
 
 
 @pytest.mark.parametrize("turn", range(8))
@@ -194,5 +214,6 @@ def test_a_shader_lights_what_it_pads() -> None:
     given = gbuffer(height=29, width=37)
     irradiance, through = torch.rand(1, 3, 29, 37), torch.rand(1, 3, 12)
     with torch.inference_mode():
-        image = shader.lit(shader.padded(given), irradiance, through)
+        image, error = shader.lit(shader.padded(given), irradiance, through)
+    assert error == 0
     assert image.shape == (1, 3, 32, 40)

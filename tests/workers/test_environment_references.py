@@ -178,7 +178,7 @@ def test_open_directions_add_up_to_directional_occlusion(corner: Scene, above: C
     assert total == pytest.approx(occlusion.ravel(), abs=0.05)
     assert (total - occlusion.ravel()).mean() == pytest.approx(0, abs=0.005)
     # The wall, endless, ends at a radius of 1: what is nearer than that stops a ray towards it.
-    x, y, z = hits.p.numpy()
+    _, y, z = hits.p.numpy()
     floor, toward = y < 1e-3, (rotation_of(above.matrix).T @ DIRECTIONS.T)
     for k in np.flatnonzero(toward[1] > 0.3)[::7]:
         far = (z + 1) / np.maximum(-toward[2, k], 1e-9)  # along the ray to the wall

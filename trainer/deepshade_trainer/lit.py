@@ -41,11 +41,13 @@ class Lit(Dataset):
     """Samples with a layer `reference_<effect>_directions`, relit by lamps in those directions.
 
     The reference under lamps is exact, without noise: a sum over those that are open. `towards`
-    (1, 3, 1, K) are the directions in camera space in which a network is told of the light.
+    (1, 3, 1, K) are the directions in camera space in which a network is told of the light, and
+    `cell` the pixels along a side of its cells.
     """
 
-    def __init__(self, folders: Sequence[Path], effect: str, towards: Float) -> None:
+    def __init__(self, folders: Sequence[Path], effect: str, towards: Float, cell: int) -> None:
         super().__init__(folders, effect, per_channel=False)
+        self.cell = cell
         self.layer = f"{self.reference}_directions"
         self._lobes = [_shares(towards[0, :, 0].T, DIRECTIONS @ turn.T) for turn in _TURNS]
         grid = DIRECTIONS @ directions(_ROWS, 2 * _ROWS).reshape(3, -1)
@@ -83,11 +85,23 @@ class Lit(Dataset):
         pair = self._relit(number, sample["normal"], light, part)
         turn = int(rng.integers(len(_TURNS)))
         gbuffer, _ = self._seen(number, sample, turn, rng)
+        at = rng.integers(0, self.cell, 2)
+        packed = symmetry.apply(self._packed(number, part), None, turn)
+        open_ = np.unpackbits(packed[:, at[0] :: self.cell, at[1] :: self.cell], axis=0)
         return (
             gbuffer,
             *(symmetry.apply(image, None, turn) for image in pair),
             self._through(light, turn),
+            at,
+            open_.astype(np.float32),
+            (DIRECTIONS @ _TURNS[turn].T).astype(np.float32),
+            self._lobes[turn].astype(np.float32),
         )
+
+    def _packed(self, number: int, part: tuple[slice, ...]) -> NDArray[np.uint8]:
+        file, index = self._file(number), self.entries[number].index
+        found: NDArray[np.uint8] = file.get_slice(self.layer)[index, :, *part]
+        return found
 
     def _light(self, number: int, normal: Float, rng: np.random.Generator) -> Float:
         """(directions, 3): white, lamps, or the map of any sample, turned by any angle."""
@@ -116,8 +130,7 @@ class Lit(Dataset):
         `normals` (3, H, W) are those of this part (rows and columns) of the sample.
         A direction's light is the radiance of the solid angle that it stands for.
         """
-        entry = self.entries[number]
-        packed = self._file(number).get_slice(self.layer)[entry.index, :, *part]
+        packed = self._packed(number, part)
         normal = torch.from_numpy(np.ascontiguousarray(normals))
         flux = torch.from_numpy((light * (4 / _COUNT)).astype(np.float32))  # over π
         toward = torch.from_numpy(DIRECTIONS).float()

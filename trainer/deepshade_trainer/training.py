@@ -73,7 +73,8 @@ class _Trainer:
         runs = self.shader.per_channel
         self.data: Dataset
         if self.network.environment:
-            self.data = Lit(folders, recipe.effect, self.network.towards.numpy(force=True))
+            towards = self.network.towards.numpy(force=True)
+            self.data = Lit(folders, recipe.effect, towards, self.network.config.fold)
         elif self.device.type == "cpu":
             self.data = Dataset(folders, recipe.effect, per_channel=runs)
         else:
@@ -204,8 +205,8 @@ class _Trainer:
         mixed = recipe.precision == "bf16"
         given = [each.to(self.device) for each in batch.light]
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
-            image = self._answered(self.shader, gbuffer, given)
-        loss = self.loss(*self.shader.compared(image, reference))
+            image, error = self._answered(self.shader, gbuffer, given)
+        loss = self.loss(*self.shader.compared(image, reference)) + error
         self.optimizer.zero_grad(set_to_none=True)
         if not torch.isfinite(loss):
             return math.nan, f"loss {float(loss)}"
@@ -225,12 +226,16 @@ class _Trainer:
         return float(loss.detach()), ""
 
     @staticmethod
-    def _answered(shader: Shader, gbuffer: Tensor, given: Sequence[Tensor]) -> Tensor:
-        """The answer on the transfer curve, as large as the G-buffer."""
+    def _answered(
+        shader: Shader, gbuffer: Tensor, given: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """The answer on the transfer curve, as large as the G-buffer; and `Shader.lit`'s error."""
         height, width = gbuffer.shape[2:]
         padded = shader.padded(gbuffer)
-        image = shader.lit(padded, *given) if given else shader.on_curve(padded)
-        return image[:, :, :height, :width]
+        image, error = (
+            shader.lit(padded, *given) if given else (shader.on_curve(padded), torch.zeros(()))
+        )
+        return image[:, :, :height, :width], error
 
     def _validate(self, log: Any, step: int) -> dict[str, float]:
         """Mean DSSIM and MAE of the averaged weights, beside the trivial answer's DSSIM."""
@@ -244,7 +249,8 @@ class _Trainer:
             gbuffer, light, sample = self.data.judged(number)
             given = [each.to(self.device) for each in light]
             with torch.inference_mode():
-                found = shader.bounded(self._answered(shader, gbuffer.to(self.device), given))
+                found, _ = self._answered(shader, gbuffer.to(self.device), given)
+                found = shader.bounded(found)
             answer = found.cpu().flatten(0, 1).numpy()
             reference, blank = sample[self.data.reference], sample["trivial"]
             image, truth, nothing = (

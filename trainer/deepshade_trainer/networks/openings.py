@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,10 @@ from deepshade_trainer.networks.horizons import covered, unit
 from deepshade_trainer.networks.network import Network, check_types
 from deepshade_trainer.networks.receptive_field import Span
 from deepshade_trainer.networks.reflections import blurred, mean, turned
+
+# Of a sample: row and column of a pixel in its cells; which directions it is open to
+# (directions, h, w); these (directions, 3); and how much of each a lobe sees (lobes, directions).
+Probe = tuple[Tensor, Tensor, Tensor, Tensor]
 
 LEVEL = 5  # the map is seen through lobes of exponent 2^LEVEL
 _HALVES = 4  # vectors are found for 2 x 2 parts of a cell
@@ -90,8 +95,8 @@ class Openings(Network):
         super().__init__()
         self.config = config
         self.trunk = _Trunk(config)
-        planes = 3 * _HALVES + config.fold**2
-        weights = torch.randn(config.directions, planes, config.features)
+        self.planes = 3 * _HALVES + config.fold**2
+        weights = torch.randn(config.directions, self.planes * config.features)
         self.weights = nn.Parameter(weights * 0.02)
         towards = torch.from_numpy(fibonacci(config.directions).T).float()
         self.register_buffer("towards", towards[None, :, None], persistent=False)
@@ -126,18 +131,74 @@ class Openings(Network):
         `irradiance` (N, C, H, W) is that of the open surface, over π, and of background the map's
         mean; `through` (N, C, directions) the maps in camera space, through lobes.
         """
-        config = self.config
-        first = config.normal or 0
-        occlusion, features = self.trunk(gbuffer, first)
+        return self._lit(gbuffer, *self.told(gbuffer), irradiance, through)
+
+    def told(self, gbuffer: Tensor) -> tuple[Tensor, Tensor]:
+        """Ambient occlusion (N, 1, H, W), and features (N, features, h, w) of cells."""
+        occlusion, features = self.trunk(gbuffer, self.config.normal or 0)
+        return occlusion, features.float()
+
+    def learnt(
+        self, gbuffer: Tensor, irradiance: Tensor, through: Tensor, probes: Sequence[Probe]
+    ) -> tuple[Tensor, Tensor]:
+        """`lit`, and the mean square error of what is open to each direction, times its cosine.
+
+        A probe is of one sample each, at one pixel of every cell.
+        """
+        occlusion, features = self.told(gbuffer)
+        errors = [
+            self._error(gbuffer[k], occlusion[k, 0], features[k], *probe)
+            for k, probe in enumerate(probes)
+        ]
+        return self._lit(gbuffer, occlusion, features, irradiance, through), torch.stack(
+            errors
+        ).mean()
+
+    def _error(
+        self,
+        gbuffer: Tensor,
+        occlusion: Tensor,
+        features: Tensor,
+        at: Tensor,
+        open_: Tensor,
+        towards: Tensor,
+        shares: Tensor,
+    ) -> Tensor:
+        fold, first = self.config.fold, self.config.normal or 0
+        row, column = (int(v) for v in at)
+        cells = gbuffer[:, row::fold, column::fold].flatten(1)  # (C, cells)
+        normal = unit(cells[None, first : first + 3, None])[0, :, 0]
+        half = row * 2 // fold * 2 + column * 2 // fold
+        planes = [*(axis * _HALVES + half for axis in range(3))]
+        planes.append(3 * _HALVES + row * fold + column)
+        weights = self.weights.reshape(len(self.weights), self.planes, -1)[:, planes]
+        told = weights @ features.flatten(1) * (1 / self.config.features)  # (K, 4, cells)
+        blend = (told[:, :3] * normal).sum(1) + told[:, 3]
+        contrast = shares - shares.mean(0, keepdim=True)  # (K, directions)
+        cosine = (towards @ normal).clamp_min(0)
+        there = occlusion[row::fold, column::fold].flatten()
+        found = there * cosine + contrast.T @ blend * (len(towards) / 4)
+        inside = covered(cells[first + 5])
+        return ((found - open_.flatten(1) * cosine) ** 2 * inside).mean()
+
+    def _lit(
+        self,
+        gbuffer: Tensor,
+        occlusion: Tensor,
+        features: Tensor,
+        irradiance: Tensor,
+        through: Tensor,
+    ) -> Tensor:
+        config, first = self.config, self.config.normal or 0
         with full_precision():
             count, colours, _ = through.shape
             high, wide = features.shape[2:]
-            planes, width = self.weights.shape[1:]
+            planes, width = self.planes, config.features
             # divided, so that weights are learnt at the pace of all others
             contrast = (through - through.mean(2, keepdim=True)) * (1 / width)
-            weights = contrast @ self.weights.flatten(1)  # (N, C, planes * features)
+            weights = contrast @ self.weights  # (N, C, planes * features)
             weights = weights.reshape(count, colours * planes, width)
-            told = weights @ features.float().flatten(2)
+            told = weights @ features.flatten(2)
             told = told.reshape(count * colours, planes, high, wide)
             vectors = F.pixel_shuffle(told[:, : 3 * _HALVES], 2)  # (N C, 3, 2h, 2w)
             vectors = F.interpolate(vectors, scale_factor=config.fold / 2, mode="nearest")
