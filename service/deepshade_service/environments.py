@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from deepshade import pictures
+from deepshade.effects import SETTINGS
 from deepshade.environments import SUFFIXES, Environment, Prepared, read_environment, sky
 from deepshade.environments.hdr import MAGIC
 from deepshade.errors import DeepshadeError, nearest
@@ -22,7 +23,7 @@ from deepshade_service.problems import Problem
 
 log = logging.getLogger("deepshade.service")
 
-DEFAULT = "sky"  # generated: it is there without a folder
+DEFAULT = str(SETTINGS["environment"].default)  # generated: it is there without a folder
 MAX_PREPARED = 4  # in memory, about 100 MB each; of others the one used longest ago goes
 MAX_MAPS = 1024  # that uploads may add up to
 
