@@ -109,7 +109,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lifespan=service.running,
     )
     app.state.service = service
-    problems.install(app)
+    problems.install(app, ShadeParameters.model_fields)
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
 
