@@ -25,7 +25,7 @@ from deepshade_service import environment_routes as routes
 from deepshade_service import problems
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
-from deepshade_service.environments import Environments
+from deepshade_service.environments import SHARE, Environments
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, find_effects, not_ready
@@ -48,7 +48,11 @@ class Service:
         self.workers = Workers(settings.workers, settings.queue)
         self.uploads = Uploads(settings)
         self.memory = MemoryBudget(settings.memory)
-        self.environments = Environments(settings.environments, environment_limits(settings.limits))
+        self.environments = Environments(
+            settings.environments,
+            environment_limits(settings.limits),
+            int(SHARE * settings.memory),
+        )
         self.shader = Shader(
             self.models, self.workers, self.memory, settings.limits, self.environments
         )
