@@ -260,8 +260,18 @@ def _bundle(bundle: Bundle, models: Models) -> dict[str, Any]:
         "engine": backend and backend.engine,
         "precision": backend and backend.precision,
         "dssim": bundle.dssim,
+        "times": _times(bundle, str(backend)),
         "metrics": bundle.metrics,
     }
+
+
+def _times(bundle: Bundle, backend: str) -> list[dict[str, Any]]:
+    """What the network was published to take on that backend: on which machine, for what size."""
+    return [
+        {"machine": machine, "size": found["size"], "ms": found["ms"][backend]}
+        for machine, found in bundle.metrics.get("speed", {}).items()
+        if backend in found["ms"]
+    ]
 
 
 def _header_name(fact: str) -> str:

@@ -11,7 +11,10 @@ import pytest
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
+from deepshade_service.config import Settings
 from deepshade_service.memory import need_of
+
+from .conftest import ORDINARY, Local
 
 EXR = {"Content-Type": "image/x-exr"}
 SHADED = ("ao", "dof", "sss")
@@ -53,9 +56,12 @@ def root(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def local(start, root):
-    return start(models=root)
+@pytest.fixture(scope="module")
+def local(root):
+    service = Local(Settings(**ORDINARY, models=root))
+    service.wait()
+    yield service
+    service.stop()
 
 
 @pytest.fixture
@@ -123,7 +129,8 @@ def test_each_layer_is_the_answer_that_the_effect_gives_alone(
     assert len(reads) == decodes
 
 
-def test_times_and_counters_are_by_effect(local, view, make_exr):
+def test_times_and_counters_are_by_effect(start, root, view, make_exr):
+    local = start(models=root)
     timing = shade(local, "sss,ao", make_exr(view)).headers["server-timing"]
     names = [entry.partition(";")[0] for entry in timing.split(", ")]
     assert names[:4] == ["decode", "plan", "infer", "encode"]
@@ -182,8 +189,9 @@ def test_a_setting_counts_for_the_effects_that_have_it(local, view, make_exr):
             np.testing.assert_array_equal(found[f"{effect}.{name}"], plane)
 
 
-def test_a_request_ends_between_effects(local, view, make_exr, wait_until):
-    """The client leaves while the first effect is computed: the second is not."""
+def test_a_request_ends_between_effects(start, root, view, make_exr, wait_until):
+    """It is given up while the first effect is computed: the second is not."""
+    local = start(models=root)
     (bundle,) = local.service.models.find("sss")
     second = local.run(local.service.models.engine(bundle, local.service.models.backend(bundle)))
     first, entered, left = local.engine(), threading.Event(), threading.Event()
@@ -191,14 +199,12 @@ def test_a_request_ends_between_effects(local, view, make_exr, wait_until):
     first.predict = lambda x: (entered.set(), left.wait(10), predict(x))[2]
     second.predict = lambda x: calls.append(1)
 
-    def leave():
+    def give_up():
         entered.wait(10)
-        service = local.service
-        job = next(iter(service.workers._running))
-        job.set()
+        next(iter(local.service.workers._running)).set()
         left.set()
 
-    threading.Thread(target=leave).start()
+    threading.Thread(target=give_up).start()
     assert shade(local, "ao,sss", make_exr(view)).status_code == 503
     wait_until(lambda: not local.service.workers.taken)
     assert not calls
