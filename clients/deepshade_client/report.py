@@ -71,7 +71,7 @@ def _meaning(setting: dict[str, Any]) -> str:
     default = setting["default"]
     shown = f"{default:g}" if isinstance(default, int | float) else default
     without = ", else ".join(str(each) for each in (setting["header"], shown) if each is not None)
-    return escape(f"{setting['meaning']} ({without})")
+    return escape(f"{setting['meaning']}; without it {without}")
 
 
 def _times(bundle: dict[str, Any], on: str) -> str:
@@ -112,7 +112,9 @@ def _line(result: Result) -> str:
     facts, timing = result.saved.facts, result.saved.timing
     parts = [f"[green]✓[/green] {escape(str(result.task.target))}  {result.seconds:.2f} s"]
     if timing:
-        parts.append(" ".join(f"{name} {ms:.0f}" for name, ms in timing.items()) + " ms")
+        # of several effects the sums: "infer-ao" and such are in the JSON
+        sums = (f"{name} {ms:.0f}" for name, ms in timing.items() if "-" not in name)
+        parts.append(f"{' '.join(sums)} ms")
     derived = {value: None for name, value in facts.items() if name.endswith("derived") and value}
     if derived:
         parts.append(f"derived {escape('; '.join(derived))}")
