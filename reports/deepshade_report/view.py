@@ -16,6 +16,8 @@ from deepshade import exr, judging, metrics
 from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS, SETTINGS, Effect
+from deepshade.environments import Surroundings
+from deepshade.environments.stored import surroundings_of
 from deepshade.errors import DataError
 from deepshade.files import sha256
 from deepshade.gbuffer.background import remove
@@ -34,10 +36,11 @@ class View:
     """One picture's attributes and the reference of one effect.
 
     `attributes` are (C, H, W) by name, camera space and scene units, zero where `background`
-    (H, W) is true, but for those that say something there. `reference` is (C', H, W). `radius` is
-    the effect's, in scene units. The `camera` may show more: the view is then a window of its
-    frame. `record` is what the data set's manifest keeps to render the view again. `error` is the
-    reference's standard error, where that is known.
+    (H, W) is true, but for those that say something there; the trivial answer's layer lies beside.
+    `reference` is (C', H, W). `radius` is the effect's, in scene units. The `camera` may show more:
+    the view is then a window of its frame. `record` is what the data set's manifest keeps to render
+    the view again. `error` is the reference's standard error, where that is known; `surroundings`
+    is the environment that it was rendered under.
     """
 
     scene: str
@@ -49,6 +52,7 @@ class View:
     camera: Camera
     record: Mapping[str, Any] = field(default_factory=dict)
     error: Float | None = None
+    surroundings: Surroundings | None = None
 
     @property
     def height(self) -> int:
@@ -62,7 +66,7 @@ class View:
 
     def trivial(self) -> Float:
         """(C', H, W): the answer of doing nothing."""
-        return judging.trivial(self.effect, self.attributes, self.reference)
+        return judging.trivial(self.effect, self.attributes, self.reference, self.surroundings)
 
     def exposed(self, image: Float) -> Float:
         """(C', H, W) in [0, 1]: an answer exposed as the reference is."""
@@ -82,15 +86,10 @@ class View:
         return self.attributes[names[0]] if names else None
 
     def floor(self) -> float | None:
-        """DSSIM that noise in the reference leaves to a perfect answer, at least.
-
-        That of the reference with as much noise again, which is near where noise is weak and too
-        little where it is strong; None where the reference's error isn't known.
-        """
+        """What noise in the reference leaves (`judging.floor`); None where no error is known."""
         if self.error is None:
             return None
-        noise = np.random.default_rng(0).standard_normal(self.reference.shape, np.float32)
-        return self.dssim(self.reference + noise * self.error)
+        return judging.floor(self.effect, self.reference, self.error)
 
     def contrast(self) -> float:
         """What the effect's row compares with `min_contrast`."""
@@ -103,12 +102,13 @@ def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View
     Raises DataError: `folder` holds no such data set, a shard is damaged, or no view shows enough.
     """
     row, manifest = EFFECTS[effect], Manifest.read(folder)
-    if missing := {*row.inputs, f"reference_{effect}"} - set(manifest.schema):
+    own = {f"reference_{effect}", *([row.trivial_layer] if row.trivial_layer else [])}
+    if missing := {*row.inputs, *own} - set(manifest.schema):
         raise DataError(
             f"{folder} has no {', '.join(sorted(missing))}",
             fix=f"render it with --effects {effect}",
         )
-    own = {f"reference_{effect}", f"reference_{effect}_error"}
+    own.add(f"reference_{effect}_error")
     names = [name for name in manifest.schema if name in ATTRIBUTES or name in own]
     found: list[View] = []
     for shard in manifest.shards:
@@ -143,13 +143,15 @@ def _read(
                 planes = {name: plane[index].astype(np.float32) for name, plane in stored.items()}
                 reference = planes.pop(f"reference_{effect.name}")
                 error = planes.pop(f"reference_{effect.name}_error", None)
+                beside = {name: planes.pop(name) for name in planes.keys() - ATTRIBUTES.keys()}
                 background, _ = remove(planes, list(planes))
+                planes |= beside
                 known = record["camera"]
                 frame = known["fov"], *known["frame"], known["world_to_camera"], *known["origin"]
                 radius = float(record.get("radius") or 1.0)
                 scene, camera = str(record["scene"]), Camera(*frame)
                 made = effect, planes, background, reference, radius, camera, record, error
-                yield View(scene, *made)
+                yield View(scene, *made, surroundings_of(path.parent, record))
     except (OSError, ValueError, KeyError, IndexError, TypeError) as problem:
         raise DataError(f"{path} can't be read: {problem!r}") from problem
 
