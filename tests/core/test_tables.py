@@ -40,7 +40,7 @@ def test_attributes_are_the_designs():
 # the design's table of effects, written out a second time: inputs, background, trivial, settings
 DESIGN = {
     "ao": ("N_s P_s", 1.0, 1.0, "radius"),
-    "do": ("N_w N_s P_s", 1.0, "irradiance", "radius environment"),
+    "do": ("N_w N_s P_s", "shaded", "irradiance", "radius environment"),
     "ibl": ("N_w C_w R_diff R_spec R_gloss", "shaded", "diffuse", "environment"),
     "gi": ("N_s P_s L_diff", 0.0, 0.0, "radius"),
     "sss": ("P_s R_scatt L", "light", "light", ""),

@@ -33,6 +33,7 @@ SAVE_EVERY = 250
 VALIDATE_EVERY = 500
 VALIDATION_SAMPLES = 96
 MAX_BAD_BATCHES = 100
+OPEN = 10.0  # the weight of `Shader.lit`'s error: about as much as the picture's then
 
 
 @dataclass(frozen=True)
@@ -206,7 +207,7 @@ class _Trainer:
         given = [each.to(self.device) for each in batch.light]
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
             image, error = self._answered(self.shader, gbuffer, given)
-        loss = self.loss(*self.shader.compared(image, reference)) + error
+        loss = self.loss(*self.shader.compared(image, reference)) + OPEN * error
         self.optimizer.zero_grad(set_to_none=True)
         if not torch.isfinite(loss):
             return math.nan, f"loss {float(loss)}"
