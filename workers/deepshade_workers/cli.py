@@ -74,7 +74,7 @@ def render(
         str, typer.Option(help="Attributes to write, commas between.  [default: all]")
     ] = "",
     layers: Annotated[
-        str, typer.Option(help="More to render, commas between: do_visibility.")
+        str, typer.Option(help="More to render, commas between: do_visibility, do_directions.")
     ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
@@ -243,7 +243,7 @@ def datagen(
     ] = None,
     skies: Annotated[int, typer.Option(help="How many different skies.", min=0)] = 64,
     layers: Annotated[
-        str, typer.Option(help="More to render, commas between: do_visibility.")
+        str, typer.Option(help="More to render, commas between: do_visibility, do_directions.")
     ] = "",
     shard_size: Annotated[int, typer.Option(help="Samples in a shard.", min=1)] = 128,
     address: Annotated[
