@@ -93,7 +93,8 @@ def _export(
         raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
     marks = [float32_marks(graph, prefix) for prefix in shader.rounded] or [([OUTPUT], [])]
     further = {name: tensor.numpy() for name, tensor in zip(INPUTS, given[1:], strict=True)}
-    counted = given[0].shape[1], *[up(_COUNTED, shader.size_multiple)] * 2
+    side = up(_COUNTED, shader.size_multiple)
+    counted = given[0].shape[1], side, side
     config = {
         "effect": effect.name,
         "name": folder.name,
