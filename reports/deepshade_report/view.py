@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +17,8 @@ from deepshade import exr, judging, metrics
 from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS, SETTINGS, Effect
+from deepshade.environments import Environment, Prepared, world_to_map
+from deepshade.environments.stored import read_stored
 from deepshade.errors import DataError
 from deepshade.files import sha256
 from deepshade.gbuffer.background import remove
@@ -37,7 +40,8 @@ class View:
     (H, W) is true, but for those that say something there. `reference` is (C', H, W). `radius` is
     the effect's, in scene units. The `camera` may show more: the view is then a window of its
     frame. `record` is what the data set's manifest keeps to render the view again. `error` is the
-    reference's standard error, where that is known.
+    reference's standard error, where that is known, and `environment` the map that the view is lit
+    by, where the effect has one.
     """
 
     scene: str
@@ -49,6 +53,17 @@ class View:
     camera: Camera
     record: Mapping[str, Any] = field(default_factory=dict)
     error: Float | None = None
+    environment: Environment | None = None
+
+    @property
+    def rotate(self) -> float:
+        """Degrees that the environment is turned by."""
+        return float(self.record.get("rotate", 0.0))
+
+    @property
+    def to_map(self) -> NDArray[np.float64]:
+        """(3, 3): turns directions of the world into those of the environment."""
+        return world_to_map(self.rotate)
 
     @property
     def height(self) -> int:
@@ -62,7 +77,8 @@ class View:
 
     def trivial(self) -> Float:
         """(C', H, W): the answer of doing nothing."""
-        return judging.trivial(self.effect, self.attributes, self.reference)
+        mean = self.environment.mean if self.environment else None
+        return judging.trivial(self.effect, self.attributes, self.reference, mean)
 
     def exposed(self, image: Float) -> Float:
         """(C', H, W) in [0, 1]: an answer exposed as the reference is."""
@@ -95,6 +111,18 @@ class View:
     def contrast(self) -> float:
         """What the effect's row compares with `min_contrast`."""
         return judging.contrast(self.effect, self.reference, self.trivial())
+
+
+@lru_cache(maxsize=4)
+def prepared(environment: Environment) -> Prepared:
+    """What graphs and rivals look up in a view's environment."""
+    return Prepared.of(environment)
+
+
+@lru_cache(maxsize=64)
+def _stored(folder: Path, digest: str, name: str) -> Environment:
+    """Views under one map share it."""
+    return read_stored(folder, digest, name)
 
 
 def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View]:
@@ -149,9 +177,15 @@ def _read(
                 radius = float(record.get("radius") or 1.0)
                 scene, camera = str(record["scene"]), Camera(*frame)
                 made = effect, planes, background, reference, radius, camera, record, error
-                yield View(scene, *made)
+                yield View(scene, *made, _surroundings(path.parent, effect, record))
     except (OSError, ValueError, KeyError, IndexError, TypeError) as problem:
         raise DataError(f"{path} can't be read: {problem!r}") from problem
+
+
+def _surroundings(folder: Path, effect: Effect, record: Mapping[str, Any]) -> Environment | None:
+    if "environment" not in effect.settings or "environment_sha256" not in record:
+        return None
+    return _stored(folder, record["environment_sha256"], record["environment"])
 
 
 def fullest(views: Sequence[View]) -> View:
