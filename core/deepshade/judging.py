@@ -9,23 +9,44 @@ from numpy.typing import NDArray
 
 from deepshade import metrics
 from deepshade.effects import Effect
+from deepshade.effects.effect import IRRADIANCE
+from deepshade.environments import Surroundings
+from deepshade.errors import DataError
 
 Float = NDArray[np.float32]
 
 
 def trivial(
     effect: Effect,
-    attributes: Mapping[str, Float],
+    images: Mapping[str, Float],
     reference: Float,
-    environment: NDArray[np.floating] | None = None,
+    surroundings: Surroundings | None = None,
 ) -> Float:
-    """The answer of doing nothing, shaped as the reference (C, H, W).
+    """The answer of doing nothing (`Effect.trivial`), shaped as the reference (C, H, W).
 
-    Under an `environment`, whose mean (3,) this is, it is multiplied by that.
+    `images` hold the effect's inputs and its `trivial_layer`. Raises DataError where the answer
+    depends on an environment and none is given.
     """
-    factor = np.float32(1) if environment is None else environment[:, None, None]
-    plain = attributes[effect.trivial] if isinstance(effect.trivial, str) else effect.trivial
-    return np.broadcast_to(plain * factor, reference.shape).astype(np.float32)
+    known = effect.trivial
+    plain: Float | np.float32
+    if not isinstance(known, str):
+        plain = np.float32(known)
+    elif known == IRRADIANCE:
+        plain = _known(effect, surroundings).irradiance(images["normal_world"])
+    else:
+        plain = images[effect.trivial_layer or known]
+        if known in effect.inputs and "environment" in effect.settings:
+            plain = plain * _known(effect, surroundings).mean[:, None, None]
+    return np.broadcast_to(plain, reference.shape).astype(np.float32)
+
+
+def _known(effect: Effect, surroundings: Surroundings | None) -> Surroundings:
+    if surroundings is None:
+        raise DataError(
+            f"nothing says what environment lights this, on which '{effect.name}' depends",
+            fix="render it with 'deepshade datagen', which keeps maps beside what they lit",
+        )
+    return surroundings
 
 
 def exposed(effect: Effect, reference: Float, *images: Float) -> list[Float]:

@@ -17,8 +17,8 @@ from deepshade import exr, judging, metrics
 from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS, SETTINGS, Effect
-from deepshade.environments import Environment, Prepared, world_to_map
-from deepshade.environments.stored import read_stored
+from deepshade.environments import Environment, Prepared, Surroundings
+from deepshade.environments.stored import surroundings_of
 from deepshade.errors import DataError
 from deepshade.files import sha256
 from deepshade.gbuffer.background import remove
@@ -37,11 +37,11 @@ class View:
     """One picture's attributes and the reference of one effect.
 
     `attributes` are (C, H, W) by name, camera space and scene units, zero where `background`
-    (H, W) is true, but for those that say something there. `reference` is (C', H, W). `radius` is
-    the effect's, in scene units. The `camera` may show more: the view is then a window of its
-    frame. `record` is what the data set's manifest keeps to render the view again. `error` is the
-    reference's standard error, where that is known, and `environment` the map that the view is lit
-    by, where the effect has one.
+    (H, W) is true, but for those that say something there; the trivial answer's layer lies beside.
+    `reference` is (C', H, W). `radius` is the effect's, in scene units. The `camera` may show more:
+    the view is then a window of its frame. `record` is what the data set's manifest keeps to render
+    the view again. `error` is the reference's standard error, where that is known; `surroundings`
+    is the environment that it was rendered under.
     """
 
     scene: str
@@ -53,17 +53,7 @@ class View:
     camera: Camera
     record: Mapping[str, Any] = field(default_factory=dict)
     error: Float | None = None
-    environment: Environment | None = None
-
-    @property
-    def rotate(self) -> float:
-        """Degrees that the environment is turned by."""
-        return float(self.record.get("rotate", 0.0))
-
-    @property
-    def to_map(self) -> NDArray[np.float64]:
-        """(3, 3): turns directions of the world into those of the environment."""
-        return world_to_map(self.rotate)
+    surroundings: Surroundings | None = None
 
     @property
     def height(self) -> int:
@@ -77,8 +67,7 @@ class View:
 
     def trivial(self) -> Float:
         """(C', H, W): the answer of doing nothing."""
-        mean = self.environment.mean if self.environment else None
-        return judging.trivial(self.effect, self.attributes, self.reference, mean)
+        return judging.trivial(self.effect, self.attributes, self.reference, self.surroundings)
 
     def exposed(self, image: Float) -> Float:
         """(C', H, W) in [0, 1]: an answer exposed as the reference is."""
@@ -119,24 +108,19 @@ def prepared(environment: Environment) -> Prepared:
     return Prepared.of(environment)
 
 
-@lru_cache(maxsize=64)
-def _stored(folder: Path, digest: str, name: str) -> Environment:
-    """Views under one map share it."""
-    return read_stored(folder, digest, name)
-
-
 def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View]:
     """The views of a data set that have something of the effect to show, at most `limit`.
 
     Raises DataError: `folder` holds no such data set, a shard is damaged, or no view shows enough.
     """
     row, manifest = EFFECTS[effect], Manifest.read(folder)
-    if missing := {*row.inputs, f"reference_{effect}"} - set(manifest.schema):
+    own = {f"reference_{effect}", *([row.trivial_layer] if row.trivial_layer else [])}
+    if missing := {*row.inputs, *own} - set(manifest.schema):
         raise DataError(
             f"{folder} has no {', '.join(sorted(missing))}",
             fix=f"render it with --effects {effect}",
         )
-    own = {f"reference_{effect}", f"reference_{effect}_error"}
+    own.add(f"reference_{effect}_error")
     names = [name for name in manifest.schema if name in ATTRIBUTES or name in own]
     found: list[View] = []
     for shard in manifest.shards:
@@ -171,21 +155,17 @@ def _read(
                 planes = {name: plane[index].astype(np.float32) for name, plane in stored.items()}
                 reference = planes.pop(f"reference_{effect.name}")
                 error = planes.pop(f"reference_{effect.name}_error", None)
+                beside = {name: planes.pop(name) for name in planes.keys() - ATTRIBUTES.keys()}
                 background, _ = remove(planes, list(planes))
+                planes |= beside
                 known = record["camera"]
                 frame = known["fov"], *known["frame"], known["world_to_camera"], *known["origin"]
                 radius = float(record.get("radius") or 1.0)
                 scene, camera = str(record["scene"]), Camera(*frame)
                 made = effect, planes, background, reference, radius, camera, record, error
-                yield View(scene, *made, _surroundings(path.parent, effect, record))
+                yield View(scene, *made, surroundings_of(path.parent, record))
     except (OSError, ValueError, KeyError, IndexError, TypeError) as problem:
         raise DataError(f"{path} can't be read: {problem!r}") from problem
-
-
-def _surroundings(folder: Path, effect: Effect, record: Mapping[str, Any]) -> Environment | None:
-    if "environment" not in effect.settings or "environment_sha256" not in record:
-        return None
-    return _stored(folder, record["environment_sha256"], record["environment"])
 
 
 def fullest(views: Sequence[View]) -> View:

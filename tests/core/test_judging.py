@@ -7,6 +7,8 @@ import pytest
 
 from deepshade import judging, metrics
 from deepshade.effects import EFFECTS
+from deepshade.environments import Environment, Surroundings, directions
+from deepshade.errors import DataError
 
 
 def test_the_trivial_answer_is_a_number_or_an_input() -> None:
@@ -15,6 +17,31 @@ def test_the_trivial_answer_is_a_number_or_an_input() -> None:
     assert (judging.trivial(EFFECTS["dof"], {"light": light}, reference) == light).all()
     assert (judging.trivial(EFFECTS["ao"], {}, reference[:1]) == 1).all()
     assert (judging.trivial(EFFECTS["gi"], {}, reference) == 0).all()
+
+
+def test_under_an_environment_it_is_what_falls_unblocked() -> None:
+    """Of do the map's irradiance, of ibl its mean on matte surfaces, of full the ibl beside it."""
+    grid = directions(32, 64)
+    # 1 + y from above and 1 + x / 2 from the right: A(N, 1) of ω_i is 2 N_i / 3
+    light = np.stack([1 + grid[1], 1 + grid[0] / 2, np.ones_like(grid[0])])
+    surroundings = Surroundings(Environment("", light), degrees=90.0)
+    normals = np.random.default_rng(0).normal(size=(3, 5, 8)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=0)
+    normals[:, 0] = 0
+    reference = np.zeros_like(normals)
+    found = judging.trivial(EFFECTS["do"], {"normal_world": normals}, reference, surroundings)
+    x, y, z = normals
+    # turned counter-clockwise as seen from above, what was at +x is at -z
+    expected = np.stack([1 + 2 / 3 * y, 1 - z / 3, np.ones_like(x)])
+    assert found[:, 1:] == pytest.approx(expected[:, 1:], rel=0.01)
+    assert found[:, 0] == pytest.approx(1, abs=1e-3)  # the mean where nothing faces anywhere
+    matte = {"diffuse": np.full_like(reference, 0.3), "reference_ibl": normals}
+    assert judging.trivial(EFFECTS["ibl"], matte, reference, surroundings) == pytest.approx(
+        0.3, abs=1e-3
+    )
+    assert (judging.trivial(EFFECTS["full"], matte, reference, surroundings) == normals).all()
+    with pytest.raises(DataError, match="'ibl' depends"):
+        judging.trivial(EFFECTS["ibl"], matte, reference)
 
 
 def test_occlusion_shows_something_where_it_varies() -> None:

@@ -40,7 +40,7 @@ def test_attributes_are_the_designs():
 # the design's table of effects, written out a second time: inputs, background, trivial, settings
 DESIGN = {
     "ao": ("N_s P_s", 1.0, 1.0, "radius"),
-    "do": ("N_w N_s P_s", 1.0, 1.0, "radius environment"),
+    "do": ("N_w N_s P_s", 1.0, "irradiance", "radius environment"),
     "ibl": ("N_w C_w R_diff R_spec R_gloss", "shaded", "diffuse", "environment"),
     "gi": ("N_s P_s L_diff", 0.0, 0.0, "radius"),
     "sss": ("P_s R_scatt L", "light", "light", ""),
@@ -50,7 +50,7 @@ DESIGN = {
     "full": (
         "N_w C_w R_diff R_spec R_gloss N_s P_s D_focal",
         "shaded",
-        "diffuse",
+        "ibl",
         "radius focus aperture environment",
     ),
 }
@@ -63,6 +63,8 @@ def test_effects_are_the_designs():
         assert effect.name == name
         assert " ".join(ATTRIBUTES[i].symbol for i in effect.inputs) == inputs
         assert (effect.background, effect.trivial) == (background, trivial)
+        layer = effect.trivial_layer or "position"
+        assert layer in ATTRIBUTES or layer.removeprefix("reference_") in EFFECTS
         assert " ".join(effect.settings) == settings
         assert set(effect.settings) <= set(SETTINGS)
         assert effect.is_light == (name != "ao")

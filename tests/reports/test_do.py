@@ -12,7 +12,7 @@ import pytest
 
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS
-from deepshade.environments import Environment, directions, sky
+from deepshade.environments import Environment, Surroundings, directions, sky
 from deepshade.errors import DataError, DeepshadeError
 from deepshade_report.view import Float, View
 
@@ -44,9 +44,9 @@ def under(view: View, light: Any, rotate: float = 0.0) -> View:
     environment = kept(radiance.tobytes())
     height, width = view.background.shape
     camera = Camera(view.camera.fov, width, height, np.eye(4))
-    made = {"effect": EFFECTS["do"], "camera": camera, "record": {"rotate": rotate}}
+    made = {"effect": EFFECTS["do"], "camera": camera}
     answer = np.ones((3, height, width), np.float32)
-    return replace(view, **made, reference=answer, environment=environment)
+    return replace(view, **made, reference=answer, surroundings=Surroundings(environment, rotate))
 
 
 @cache
@@ -141,4 +141,4 @@ def test_the_settings_go_from_cheap_to_best_and_quick_is_fewer() -> None:
 
 def test_a_view_under_no_map_is_refused() -> None:
     with pytest.raises(DataError, match="environment"):
-        bitmask(1, 4, 4).prepare(replace(under(rubble(), 1.0), environment=None))
+        bitmask(1, 4, 4).prepare(replace(under(rubble(), 1.0), surroundings=None))

@@ -10,7 +10,7 @@ import pytest
 
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS
-from deepshade.environments import Environment, directions
+from deepshade.environments import Environment, Surroundings, directions, world_to_map
 from deepshade.errors import DeepshadeError
 from deepshade_report.view import Float, View
 
@@ -50,9 +50,8 @@ def under(environment: Environment, view: View | None = None, **given: float) ->
         effect=EFFECTS["full"],
         attributes={**view.attributes, **attributes},
         camera=camera,
-        record={"rotate": given.get("rotate", 0.0)},
         reference=np.zeros((3, *shape), np.float32),
-        environment=environment,
+        surroundings=Surroundings(environment, given.get("rotate", 0.0)),
     )
 
 
@@ -78,7 +77,7 @@ def test_a_white_furnace_gives_back_the_albedo() -> None:
 def test_a_map_of_degree_two_has_its_irradiance_and_its_mirror_image(rotate: float) -> None:
     view = under(SMOOTH, diffuse=1.0, rotate=rotate)
     there = ~view.background
-    axis = view.to_map.T @ AXIS
+    axis = world_to_map(rotate).T @ AXIS
     # over π, ∫ cosθ of 1, c and c² is 1, 2/3 c and (1 + c²) / 4
     c = np.tensordot(axis, view.attributes["normal_world"], 1)
     image = shaded(split_sum(5, Parameters()), view)[:, there]
@@ -101,7 +100,7 @@ def test_light_from_the_map_is_linear_and_never_negative() -> None:
     spot[0, 10, 20] = 5000
     view = under(Environment("spot", spot), diffuse=0.5, specular=0.3, gloss=20)
     image = shaded(split_sum(9), view)
-    twice = shaded(split_sum(9), replace(view, environment=Environment("twice", 2 * spot)))
+    twice = shaded(split_sum(9), replace(view, surroundings=Surroundings(Environment("twice", 2 * spot))))
     assert (image >= 0).all()
     assert not image[1:].any()
     assert image[0].std() > 1

@@ -12,6 +12,8 @@ from safetensors.numpy import save
 from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
+from deepshade.environments import Environment
+from deepshade.environments.stored import store
 from deepshade.manifest import Manifest, Shard
 from deepshade_trainer.export import export
 from deepshade_trainer.recipe import Recipe, preset
@@ -74,15 +76,22 @@ def write_data(folder: Path, effect: str, count: int = 8) -> Path:
     samples = []
     for seed in range(count):
         inputs = arrays(effect, seed)
-        samples.append({**inputs, f"reference_{effect}": reference(effect, inputs, seed)})
+        answer = reference(effect, inputs, seed)
+        sample = {**inputs, f"reference_{effect}": answer}
+        if (beside := EFFECTS[effect].trivial_layer) is not None:
+            sample.setdefault(beside, answer[::-1] / 2)  # with something to show beside the answer
+        samples.append(sample)
     schema = {
         name: {"dtype": str(v.dtype), "shape": list(v.shape)} for name, v in samples[0].items()
     }
     content = save({name: np.stack([sample[name] for sample in samples]) for name in schema})
     (folder / "shard-00000.safetensors").write_bytes(content)
-    records: list[dict[str, Any]] = [
-        {"scene": f"noise:{k}", "seed": k, "radius": RADIUS, "camera": {}} for k in range(count)
-    ]
+    record: dict[str, Any] = {"radius": RADIUS, "camera": {}}
+    if "environment" in EFFECTS[effect].settings:
+        white = Environment("white", np.ones((3, 8, 16), np.float32))
+        store(folder, white)
+        record |= {"environment": "white", "environment_sha256": white.sha256, "rotate": 0.0}
+    records = [{"scene": f"noise:{k}", "seed": k, **record} for k in range(count)]
     shard = Shard("shard-00000.safetensors", hashlib.sha256(content).hexdigest(), records)
     Manifest({"test": True}, schema).with_shard(shard).write(folder)
     return folder

@@ -20,8 +20,8 @@ from torch import Tensor
 from deepshade import symmetry, tensors
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
-from deepshade.environments import Prepared
-from deepshade.environments.stored import read_stored
+from deepshade.environments import Surroundings
+from deepshade.environments.stored import surroundings_of
 from deepshade.errors import DataError
 from deepshade.files import sha256
 from deepshade.manifest import Manifest, shard_path
@@ -65,19 +65,21 @@ class Dataset:
         self.effect = EFFECTS[effect]
         self.per_channel = self.effect.per_channel if per_channel is None else per_channel
         self.reference = f"reference_{effect}"
-        trivial = self.effect.trivial
-        self.attributes = tuple(
-            dict.fromkeys([*self.effect.inputs, *([trivial] if isinstance(trivial, str) else [])])
+        beside = self.effect.trivial_layer
+        self.layers = tuple(
+            dict.fromkeys([*self.effect.inputs, self.reference, *([beside] if beside else [])])
         )
         self.entries: list[Entry] = []
         self._open: dict[Path, Any] = {}
         for folder in folders:
             manifest = Manifest.read(folder)
-            missing = {*self.attributes, self.reference} - set(manifest.schema)
+            missing = set(self.layers) - set(manifest.schema)
             if missing:
+                effects = {effect, *missing.intersection([beside])}
+                names = ",".join(sorted(name.removeprefix("reference_") for name in effects))
                 raise DataError(
                     f"{folder} has no {', '.join(sorted(missing))}",
-                    fix=f"render it with --effects {effect}",
+                    fix=f"render it with --effects {names}",
                 )
             for shard in manifest.shards:
                 path = shard_path(folder, shard)
@@ -114,25 +116,22 @@ class Dataset:
             except Exception as error:  # safetensors' own error type says only "invalid header"
                 raise DataError(f"{entry.path} can't be read: {error}") from error
         file = self._open[entry.path]
-        names = (*self.attributes, self.reference)
         return {
-            name: file.get_slice(name)[entry.index].astype(np.float32, copy=False) for name in names
+            name: file.get_slice(name)[entry.index].astype(np.float32, copy=False)
+            for name in self.layers
         }
 
     def radius(self, number: int) -> float:
         """The effect radius that a sample was rendered with; 1 for an effect without."""
         return float(self.entries[number].record.get("radius", 1.0))
 
-    def environment(self, number: int) -> tuple[Prepared, float] | None:
-        """The map that a sample was rendered under, and how far it was turned, in degrees.
+    def surroundings(self, number: int) -> Surroundings | None:
+        """The environment that a sample was rendered under; None where it was under none.
 
-        None where it was under none. Raises DataError: the map isn't there.
+        Raises DataError: the map isn't there.
         """
         entry = self.entries[number]
-        if "environment_sha256" not in entry.record:
-            return None
-        digest, name = (entry.record[key] for key in ("environment_sha256", "environment"))
-        return _prepared(entry.path.parent, digest, name), float(entry.record["rotate"])
+        return surroundings_of(entry.path.parent, entry.record)
 
     def gbuffer(self, sample: Sample, radius: float, multiple: int = 1) -> NDArray[np.float32]:
         """What a network sees of a sample (N, C, h, w); N is 3 for networks run per channel.
@@ -169,11 +168,6 @@ class Dataset:
             some = slice(None) if channel is None else slice(channel, channel + 1)
             references.append(turned[self.reference][some])
         return torch.from_numpy(np.stack(inputs)), torch.from_numpy(np.stack(references))
-
-
-@lru_cache(maxsize=2)
-def _prepared(folder: Path, digest: str, name: str) -> Prepared:
-    return Prepared.of(read_stored(folder, digest, name))
 
 
 def lengths(names: Iterable[str]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from deepshade import judging, metrics, pictures
 from deepshade.bundles import Bundle
 from deepshade.effects import Effect
 from deepshade.engines import REFERENCE, Backend, load_engine
-from deepshade.environments import Prepared
+from deepshade.environments import Environment, Prepared, Surroundings
 from deepshade.errors import ConfigError, DataError
 from deepshade.machine import cpu_count
 from deepshade_trainer.dataset import Dataset, Sample, directions, lengths, rounded, shortened
@@ -62,6 +63,11 @@ class Row:
     guide: pictures.Picture
 
 
+@lru_cache(maxsize=8)  # about 75 MB each
+def _prepared(environment: Environment) -> Prepared:
+    return Prepared.of(environment)
+
+
 class Shaded:
     """A bundle on an engine, for samples of any size."""
 
@@ -75,17 +81,19 @@ class Shaded:
         data: Dataset,
         sample: Sample,
         radius: float,
-        lit: tuple[Prepared, float] | None = None,
+        lit: Surroundings | None = None,
     ) -> Image:
         """The answer (C, H, W), C of an effect run per channel from three runs.
 
-        `lit` is the sample's environment (`Dataset.environment`).
+        `lit` is the sample's environment (`Dataset.surroundings`), where the bundle takes one.
         """
         height, width = sample[data.reference].shape[1:]
         gbuffer = data.gbuffer(sample, radius, self.bundle.size_multiple)
-        if self.bundle.environment and lit is None:
-            raise DataError(f"the samples have no environment, which {self.bundle.name} needs")
-        given = lit[0].inputs(self.bundle.environment, lit[1], "y") if lit else {}
+        given: dict[str, Image] = {}
+        if names := self.bundle.environment:
+            if lit is None:
+                raise DataError(f"the samples have no environment, which {self.bundle.name} needs")
+            given = _prepared(lit.environment).inputs(names, lit.degrees, lit.up)
         shaded: Image = self.engine.predict(gbuffer, given)
         return shaded.reshape(-1, *shaded.shape[2:])[:, :height, :width]
 
@@ -118,9 +126,8 @@ def evaluate(
     for number, entry in enumerate(data.entries):
         sample = data.load(number)
         reference = sample[data.reference]
-        lit = data.environment(number)
-        mean = lit[0].environment.mean if lit else None
-        blank = judging.trivial(effect, sample, reference, mean)
+        lit = data.surroundings(number)
+        blank = judging.trivial(effect, sample, reference, lit)
         contrast = judging.contrast(effect, reference, blank)
         if contrast < least:
             continue

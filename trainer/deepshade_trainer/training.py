@@ -99,7 +99,8 @@ class _Trainer:
                 self.warnings.append(f"not validated on: {self.data.entries[number].name}")
                 continue
             reference = sample[self.data.reference]
-            blank = judging.trivial(effect, sample, reference)
+            lit = self.data.surroundings(number)
+            blank = judging.trivial(effect, sample, reference, lit)
             if judging.contrast(effect, reference, blank) >= effect.min_contrast:
                 found.append(number)
         if not found and self.recipe.val_fraction:
@@ -236,7 +237,8 @@ class _Trainer:
                 answer = shader(shader.padded(gbuffer.to(self.device))).cpu().flatten(0, 1).numpy()
             reference = sample[self.data.reference]
             answer = answer[:, : reference.shape[1], : reference.shape[2]]
-            blank = judging.trivial(effect, sample, reference)
+            lit = self.data.surroundings(number)
+            blank = judging.trivial(effect, sample, reference, lit)
             image, truth, nothing = (
                 torch.from_numpy(each)[None]
                 for each in judging.exposed(effect, reference, answer, reference, blank)

@@ -9,6 +9,7 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.symmetry import ALL
 
 RGB = ("R", "G", "B")
+IRRADIANCE = "irradiance"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,9 +27,11 @@ class Effect:
 
     `background` is the answer where there is no surface: a number; "light", what came in there;
     or "shaded", what the network makes of it (a blurred sky). `trivial` is the answer of doing
-    nothing, a number or an input: every error is shown beside its error. A view has something to
-    show where `contrast` (the reference's standard deviation, or the trivial answer's DSSIM) is
-    at least `min_contrast`.
+    nothing, beside whose error every error is shown: a number; an input, which under an
+    environment is multiplied by its mean; another effect, by its reference; or "irradiance", what
+    of the environment falls on unblocked surfaces. A view has something to show where `contrast`
+    (the reference's standard deviation, or the trivial answer's DSSIM) is at least
+    `min_contrast`.
 
     `settings` name what a user sets (`deepshade.effects.settings`). `symmetries` are the turns and
     mirrors that a view may be learnt in: all 8, but where world-space directions would be
@@ -52,7 +55,7 @@ class Effect:
     symmetries: tuple[int, ...] = ALL
 
     def __post_init__(self) -> None:
-        for name in (*self.inputs, *(n for n in (self.trivial,) if isinstance(n, str))):
+        for name in self.inputs:
             if name not in ATTRIBUTES:
                 raise ValueError(f"{self.name}: no attribute is called '{name}'")
 
@@ -60,6 +63,13 @@ class Effect:
     def is_light(self) -> bool:
         """Whether the answer is radiance: exposed before it is compared or shown."""
         return self.range[1] is None
+
+    @property
+    def trivial_layer(self) -> str | None:
+        """What samples hold the trivial answer as; None where it takes no layer of theirs."""
+        if not isinstance(self.trivial, str) or self.trivial == IRRADIANCE:
+            return None
+        return self.trivial if self.trivial in ATTRIBUTES else f"reference_{self.trivial}"
 
     @property
     def storage(self) -> str:

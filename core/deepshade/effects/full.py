@@ -9,7 +9,7 @@ EFFECT = Effect(
     ("normal_world", "view", "diffuse", "specular", "gloss", "normal", "position", "focal"),
     "ibl weighted by ao, seen through a thin lens",
     lengths="radius",
-    trivial="diffuse",
+    trivial="ibl",
     settings=("radius", "focus", "aperture", "environment"),
     symmetries=ROTATIONS,
 )

@@ -15,6 +15,7 @@ from deepshade.environments.environment import (
 )
 from deepshade.environments.inputs import INPUTS, Prepared, black
 from deepshade.environments.sky import sky
+from deepshade.environments.surroundings import Surroundings
 
 __all__ = [
     "INPUTS",
@@ -22,6 +23,7 @@ __all__ = [
     "SUFFIXES",
     "Environment",
     "Prepared",
+    "Surroundings",
     "Up",
     "black",
     "directions",

@@ -95,6 +95,14 @@ def prefilter(environment: Environment) -> Float:
     return table
 
 
+def diffuse(environment: Environment) -> Environment:
+    """A(d, 1) as a map of its own: what falls on an unblocked surface that faces d, over π."""
+    radiance = environment.radiance
+    blurred = _blurred(_resized(radiance, _COARSEST), 1.0)
+    low, high = (radiance.min((1, 2)), radiance.max((1, 2)))
+    return Environment(environment.name, np.clip(blurred, low[:, None, None], high[:, None, None]))
+
+
 def _place(table: Float, tile: Tile, picture: Float) -> None:
     """Writes a picture (3, rows, 2 rows) and its border; a smaller one is repeated."""
     picture = np.broadcast_to(picture, (3, tile.rows, 2 * tile.rows))

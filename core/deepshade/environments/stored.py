@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from deepshade import exr
 from deepshade.environments.environment import Environment, read_environment
+from deepshade.environments.surroundings import Surroundings
 from deepshade.errors import DataError
 from deepshade.files import replacing
 
@@ -27,6 +31,17 @@ def store(folder: Path, environment: Environment) -> Path:
     return path
 
 
+def surroundings_of(folder: Path, record: Mapping[str, Any]) -> Surroundings | None:
+    """What a sample of the data set in `folder` was rendered under, by its record; None: nothing.
+
+    Maps that were read stay in memory for a while. Raises as `read_stored`.
+    """
+    if "environment_sha256" not in record:
+        return None
+    digest, name = record["environment_sha256"], record["environment"]
+    return Surroundings(_read_once(folder, digest, name), float(record["rotate"]))
+
+
 def read_stored(folder: Path, sha256: str, name: str = "") -> Environment:
     """The map of that hash in a data set's `folder`.
 
@@ -42,3 +57,6 @@ def read_stored(folder: Path, sha256: str, name: str = "") -> Environment:
     if found.sha256 != sha256:
         raise DataError(f"{path} holds another map: its hash is {found.sha256}")
     return found
+
+
+_read_once = lru_cache(maxsize=32)(read_stored)

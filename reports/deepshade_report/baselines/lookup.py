@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.camera import rotation_of
-from deepshade.environments import Environment
+from deepshade.environments import Environment, Surroundings, world_to_map
 from deepshade.environments.lobes import TILES
 from deepshade.errors import DataError
 from deepshade_report.baselines.picture import mi
@@ -66,18 +66,18 @@ def open_chain(view: View, tiles: Sequence[int], *, camera_space: bool = False) 
 
     Raises DataError: the view has none.
     """
-    environment = require(view)
-    turn = view.to_map
+    lit = require(view)
+    turn = world_to_map(lit.degrees, lit.up)
     if camera_space:
         turn = turn @ rotation_of(view.camera.matrix).T
-    return Chain(*_uploaded(environment, tuple(tiles)), vectors(turn), colour(environment.mean))
+    return Chain(*_uploaded(lit.environment, tuple(tiles)), vectors(turn), colour(lit.mean))
 
 
-def require(view: View) -> Environment:
-    """The view's environment, or DataError."""
-    if view.environment is None:
+def require(view: View) -> Surroundings:
+    """The view's environment and its turn, or DataError."""
+    if view.surroundings is None:
         raise DataError("the views are lit by no environment", fix="render them again")
-    return view.environment
+    return view.surroundings
 
 
 def vectors(rows: NDArray[np.floating]) -> list[Any]:

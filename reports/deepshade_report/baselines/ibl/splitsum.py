@@ -53,7 +53,7 @@ class Parameters:
 
 
 PUBLISHED = Parameters()
-RANGES: Ranges = {"lean": (0.0, 3.0), "sharper": (-1.5, 1.5), "window": (0.0, 0.03)}
+RANGES: Ranges = {"lean": (0.0, 10.0), "sharper": (-1.5, 1.5), "window": (0.0, 0.03)}
 
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
@@ -102,7 +102,8 @@ def open_surface(mips: int, view: View) -> Surface:
         mi.Vector3f(*(plain(plane) for plane in view.attributes[name]))
         for name in ("normal_world", "view")
     )
-    turned = projected(require(view), world_to_map(view.rotate))[:, :9].T
+    lit = require(view)
+    turned = projected(lit.environment, world_to_map(lit.degrees, lit.up))[:, :9].T
     return Surface(
         *directions,
         *(light(view.attributes[name]) for name in ("diffuse", "specular")),

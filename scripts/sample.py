@@ -1,0 +1,74 @@
+"""Renders samples/room.exr: a G-buffer with everything that nine effects need, and their references.
+
+    python scripts/sample.py
+
+About half an hour on two cores. Small enough to ship: what follows from the depth and the camera is left
+out, and light and references are half floats.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from deepshade import environments, exr
+from deepshade.attributes import ATTRIBUTES
+from deepshade.camera import Camera
+from deepshade.effects import EFFECTS
+from deepshade_workers.environments import EnvironmentLight
+from deepshade_workers.render import channels_of, render_sample
+from deepshade_workers.scenes.loading import open_scene
+from deepshade_workers.view import Light, View
+
+SCENE, WIDTH, HEIGHT = "procedural:room:7", 512, 384
+EYE, TARGET = (1.4, 1.6, 1.4), (-0.8, 0.6, -0.8)
+SAMPLES, AO_SAMPLES = 512, 1024  # rays a pixel
+SHIPPED = (
+    *("depth", "normal", "diffuse", "specular", "gloss", "scatter"),
+    *("motion", "light", "light_diffuse"),
+)
+
+
+def view() -> View:
+    """A lamp of its own, a lens, two chairs that move, and the sky that the service has."""
+    return View(
+        Camera.look_at(EYE, TARGET, (0, 1, 0), 50, WIDTH, HEIGHT),
+        radius=0.4,
+        focus=3.2,
+        aperture=0.08,
+        shutter=1.0,
+        displacements={"object 4": (0.16, 0.0, 0.02), "object 9": (-0.05, 0.0, 0.09)},
+        light=Light((0.9, 2.6, -0.6), 0.08, (18.0,) * 3, *[(0.3,) * 3] * 3),
+        surroundings=EnvironmentLight.of(environments.sky(height=512)),
+    )
+
+
+def main() -> None:
+    """Render and write."""
+    scene, seen = open_scene(SCENE), view()
+    images: dict[str, np.ndarray] = {}
+    for effects, samples in ((tuple(EFFECTS), SAMPLES), (("ao",), AO_SAMPLES)):
+        images |= render_sample(
+            *(scene, seen, WIDTH, HEIGHT),
+            effects=effects,
+            attributes=SHIPPED,
+            samples=samples,
+            seed=0,
+        )
+    channels = {
+        name: plane
+        for name, plane in channels_of(images, SHIPPED, EFFECTS).items()
+        if "_error" not in name
+    }
+    exact = ATTRIBUTES["depth"].channels
+    exr.write(
+        Path("samples/room.exr"),
+        channels,
+        half=[name for name in channels if name not in exact],
+        attributes={**seen.header(), "deepshade:scene": SCENE, "deepshade:spp": SAMPLES},
+    )
+
+
+if __name__ == "__main__":
+    main()
