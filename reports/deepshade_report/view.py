@@ -82,7 +82,12 @@ class View:
         return judging.relative(self.reference, image)
 
     def light(self) -> Float | None:
-        """(3, H, W) light that the effect starts from, None where it has none."""
+        """(3, H, W) light that the effect starts from, None where it has none.
+
+        Under an environment it is the trivial answer: what reaches surfaces that nothing blocks.
+        """
+        if "environment" in self.effect.settings:
+            return self.trivial()
         names = [name for name in self.effect.inputs if ATTRIBUTES[name].unit is RADIANCE]
         return self.attributes[names[0]] if names else None
 
@@ -106,6 +111,13 @@ class View:
 def prepared(environment: Environment) -> Prepared:
     """What graphs and rivals look up in a view's environment."""
     return Prepared.of(environment)
+
+
+def require(view: View) -> Surroundings:
+    """The view's environment and its turn, or DataError."""
+    if view.surroundings is None:
+        raise DataError("the views are lit by no environment", fix="render them again")
+    return view.surroundings
 
 
 def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View]:

@@ -27,7 +27,7 @@ except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLV
 AXIS = np.array([0.6, 0.48, -0.64])
 WHITE = Environment("white", np.full((3, 32, 64), 2, np.float32))
 # 1 + 2 c + 3 c² of the cosine to an axis: harmonics up to degree 2
-COSINE = np.tensordot(AXIS, directions(32, 64), 1)
+COSINE = np.tensordot(AXIS, directions(64, 128), 1)
 SMOOTH = Environment("smooth", np.repeat((1 + 2 * COSINE + 3 * COSINE**2)[None], 3, 0) + 1)
 
 
@@ -100,7 +100,9 @@ def test_light_from_the_map_is_linear_and_never_negative() -> None:
     spot[0, 10, 20] = 5000
     view = under(Environment("spot", spot), diffuse=0.5, specular=0.3, gloss=20)
     image = shaded(split_sum(9), view)
-    twice = shaded(split_sum(9), replace(view, surroundings=Surroundings(Environment("twice", 2 * spot))))
+    twice = shaded(
+        split_sum(9), replace(view, surroundings=Surroundings(Environment("twice", 2 * spot)))
+    )
     assert (image >= 0).all()
     assert not image[1:].any()
     assert image[0].std() > 1

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.camera import rotation_of
-from deepshade.environments import Environment, Surroundings, world_to_map
+from deepshade.environments import Environment, world_to_map
 from deepshade.environments.lobes import TILES
-from deepshade.errors import DataError
 from deepshade_report.baselines.picture import mi
-from deepshade_report.view import View, prepared
+from deepshade_report.view import View, prepared, require
 
 MEAN, MIRROR = 0, len(TILES) - 1  # tiles; that of the exponent 2^k is k + 1
 
@@ -71,13 +70,6 @@ def open_chain(view: View, tiles: Sequence[int], *, camera_space: bool = False) 
     if camera_space:
         turn = turn @ rotation_of(view.camera.matrix).T
     return Chain(*_uploaded(lit.environment, tuple(tiles)), vectors(turn), colour(lit.mean))
-
-
-def require(view: View) -> Surroundings:
-    """The view's environment and its turn, or DataError."""
-    if view.surroundings is None:
-        raise DataError("the views are lit by no environment", fix="render them again")
-    return view.surroundings
 
 
 def vectors(rows: NDArray[np.floating]) -> list[Any]:

@@ -24,10 +24,10 @@ import numpy as np
 
 from deepshade.environments import world_to_map
 from deepshade.environments.harmonics import harmonics, projected
-from deepshade_report.baselines.lookup import MIRROR, Chain, colour, open_chain, require
+from deepshade_report.baselines.lookup import MIRROR, Chain, colour, open_chain
 from deepshade_report.baselines.picture import Filter, light, mi, plain
 from deepshade_report.tuning import Ranges, Tunable, tuned
-from deepshade_report.view import View
+from deepshade_report.view import View, require
 from deepshade_trainer.networks.phong import COLUMNS, ROWS, table
 
 OCTAVES = 16  # the map itself stands at the exponent 2^16
