@@ -263,7 +263,7 @@ def test_any_size(local: Local, effect: str, size: tuple[int, int]) -> None:
     answer = shaded(local, effect, inputs, depth)
     more = (0, 0), (0, 64), (0, 64)
     wide = {
-        name: np.pad(planes, more, "edge" if ATTRIBUTES[name].in_background else "constant")
+        name: np.pad(planes, more, "edge" if ATTRIBUTES[name].goes_on else "constant")
         for name, planes in inputs.items()
     }
     wider = shaded(local, effect, wide, np.pad(depth, (0, 64)))

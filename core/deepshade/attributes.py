@@ -37,6 +37,8 @@ REFLECTANCE = Unit("reflectance")
 EXPONENT = Unit("exponent")
 RADIANCE = Unit("radiance", "float32")
 
+_SHADING = (WORLD_DIRECTION, RADIANS, REFLECTANCE, EXPONENT)
+
 
 @dataclass(frozen=True, slots=True)
 class Attribute:
@@ -52,6 +54,15 @@ class Attribute:
     unit: Unit
     meaning: str
     in_background: bool = False
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether past the picture's edge its last pixels are repeated, or there is nothing.
+
+        What light and shading are calculated from goes on, or a blurred edge would be lit by
+        nothing, or by the sky; the geometry around a point ends.
+        """
+        return self.in_background or self.unit in _SHADING
 
     @property
     def coloured(self) -> bool:

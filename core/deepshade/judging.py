@@ -70,6 +70,17 @@ def relative(reference: Float, image: Float) -> float:
     return metrics.smape(*pair)
 
 
+def floor(effect: Effect, reference: Float, error: Float) -> float:
+    """DSSIM that noise in the reference (C, H, W) leaves to a perfect answer, at least.
+
+    That of the reference with as much noise again, of its standard `error`: near it where noise is
+    weak, too little where it is strong.
+    """
+    noise = np.random.default_rng(0).standard_normal(reference.shape, np.float32)
+    again, truth = exposed(effect, reference, reference + noise * error, reference)
+    return metrics.dssim(again, truth)
+
+
 def contrast(effect: Effect, reference: Float, blank: Float) -> float:
     """How much a view shows, by the effect's measure: to be held against its `min_contrast`.
 

@@ -85,8 +85,8 @@ def planes(
         if channel is not None and attribute.coloured:
             pixels = pixels[channel : channel + 1]
         divisor = scale if attribute.unit.scaled and scale != 1 else None
-        # Past the picture is background, whose light is no darker than what lies beside it.
-        found += [Plane(plane, divisor, attribute.in_background) for plane in pixels]
+        # Past the picture there is no geometry, but light no darker than what lies beside it.
+        found += [Plane(plane, divisor, attribute.goes_on) for plane in pixels]
     return found
 
 

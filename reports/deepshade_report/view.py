@@ -92,15 +92,10 @@ class View:
         return self.attributes[names[0]] if names else None
 
     def floor(self) -> float | None:
-        """DSSIM that noise in the reference leaves to a perfect answer, at least.
-
-        That of the reference with as much noise again, which is near where noise is weak and too
-        little where it is strong; None where the reference's error isn't known.
-        """
+        """What noise in the reference leaves (`judging.floor`); None where no error is known."""
         if self.error is None:
             return None
-        noise = np.random.default_rng(0).standard_normal(self.reference.shape, np.float32)
-        return self.dssim(self.reference + noise * self.error)
+        return judging.floor(self.effect, self.reference, self.error)
 
     def contrast(self) -> float:
         """What the effect's row compares with `min_contrast`."""

@@ -10,13 +10,14 @@ import pytest
 from deepshade.camera import Camera
 
 
-def quad(center: Any, u: Any, v: Any) -> Any:
-    """A parallelogram center ± u ± v, facing u x v."""
-    from deepshade_workers.scenes.mesh import Mesh
+def quad(center: Any, u: Any, v: Any, **terms: Any) -> Any:
+    """A parallelogram center ± u ± v, facing u x v, of a material of these `terms`."""
+    from deepshade_workers.scenes.mesh import Material, Mesh
 
     c, u, v = (np.array(x, np.float64) for x in (center, u, v))
     corners = np.stack([c - u - v, c + u - v, c + u + v, c - u + v])
-    return Mesh.build(corners, np.array([[0, 1, 2], [0, 2, 3]]), crease=0)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return Mesh.build(corners, faces, crease=0, material=Material(**terms))
 
 
 def seen(scene: Any, camera: Camera, *names: str, **settings: Any) -> Any:

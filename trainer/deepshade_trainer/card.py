@@ -22,7 +22,7 @@ from deepshade_trainer.run import Run
 MAX_INT8_ADDED = 0.01  # of the DSSIM in fp32
 _WRITTEN = ("path", "metrics", "hashes")
 _COLUMNS = {"ssim": ".4f", "psnr": ".2f", "mae": ".4f", "flip": ".4f", "smape": ".4f"}
-_COLUMNS |= {"dssim": ".4f", "trivial_dssim": ".4f", "ratio": ".3f"}
+_COLUMNS |= {"dssim": ".4f", "noise": ".4f", "trivial_dssim": ".4f", "ratio": ".3f"}
 
 
 def variants(bundle: Bundle) -> dict[str, Variant]:
@@ -72,8 +72,8 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
     return write_config(bundle.path, {**config, "int8_kinds": sorted(kinds)}, metrics)
 
 
-def write_card(bundle: Bundle, run: Run, note: str) -> None:
-    """Write the bundle's README.md from its configuration, figures and recipe."""
+def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
+    """Write the bundle's README.md from its configuration, figures and recipe, if it has one."""
     effect = EFFECTS[bundle.effect]
     lines = [
         f"# {bundle.effect}/{bundle.name}",
@@ -94,10 +94,11 @@ def write_card(bundle: Bundle, run: Run, note: str) -> None:
         *_errors(bundle),
         *_speeds(bundle),
     ]
-    recipe = Recipe.read(run.recipe)
-    # A path of this machine tells nobody anything; the folder's name is what the note speaks of.
-    recipe = recipe.changed(init_from=Path(recipe.init_from).name)
-    lines += ["## Recipe", "", "```json", json.dumps(asdict(recipe), indent=1), "```", ""]
+    if run is not None:
+        recipe = Recipe.read(run.recipe)
+        # A path of this machine tells nobody anything; the folder's name is what the note speaks of
+        recipe = recipe.changed(init_from=Path(recipe.init_from).name)
+        lines += ["## Recipe", "", "```json", json.dumps(asdict(recipe), indent=1), "```", ""]
     text = "\n".join(lines) + ("\n" + note.strip() + "\n" if note else "")
     with replacing(bundle.path / "README.md") as temporary:
         temporary.write_text(text)
@@ -114,13 +115,22 @@ def _errors(bundle: Bundle) -> list[str]:
         "dssim": "on which the trivial answer's DSSIM is",
     }
     trivial = f"`{effect.trivial}`" if isinstance(effect.trivial, str) else f"{effect.trivial:g}"
-    columns = [name for name in _COLUMNS if name in next(iter(errors.values()))["exact"]]
+    if effect.trivial in effect.inputs and "environment" in effect.settings:
+        trivial += " times the environment's mean"
+    means = [mean for found in errors.values() for mean in found.values()]
+    columns = [name for name in _COLUMNS if all(name in mean for mean in means)]
     titles = [name.upper() if name not in ("trivial_dssim", "ratio") else name for name in columns]
     lines = [
         "## Error",
         "",
         f"Over views {measures[effect.contrast]} at least {effect.min_contrast:g}; the trivial "
-        f"answer is {trivial} everywhere.",
+        f"answer is {trivial} everywhere."
+        + (
+            " NOISE is the DSSIM of the reference with as much of its own noise again: about what "
+            "it leaves to a perfect answer."
+            if "noise" in columns
+            else ""
+        ),
         "",
         f"| test set | inputs | views | {' | '.join(titles)} |".replace("_dssim", " DSSIM"),
         "|---|---|---|" + "---|" * len(columns),

@@ -104,6 +104,21 @@ class Dataset:
 
     def load(self, number: int) -> Sample:
         """Sample `number`: planar float32 attributes in physical units, and its reference."""
+        entry, file = self.entries[number], self._file(number)
+        return {
+            name: file.get_slice(name)[entry.index].astype(np.float32, copy=False)
+            for name in self.layers
+        }
+
+    def error(self, number: int) -> NDArray[np.float32] | None:
+        """The standard error of a sample's reference, shaped alike; None where it isn't stored."""
+        entry, file, name = self.entries[number], self._file(number), f"{self.reference}_error"
+        if name not in file.keys():  # noqa: SIM118 (not a dict)
+            return None
+        plane: NDArray[np.float32] = file.get_slice(name)[entry.index]
+        return plane.astype(np.float32)
+
+    def _file(self, number: int) -> Any:
         entry = self.entries[number]
         if entry.path not in self._open:
             if sha256(entry.path) != entry.digest:
@@ -115,11 +130,7 @@ class Dataset:
                 self._open[entry.path] = safe_open(entry.path, framework="numpy")
             except Exception as error:  # safetensors' own error type says only "invalid header"
                 raise DataError(f"{entry.path} can't be read: {error}") from error
-        file = self._open[entry.path]
-        return {
-            name: file.get_slice(name)[entry.index].astype(np.float32, copy=False)
-            for name in self.layers
-        }
+        return self._open[entry.path]
 
     def radius(self, number: int) -> float:
         """The effect radius that a sample was rendered with; 1 for an effect without."""

@@ -109,6 +109,9 @@ def evaluate(
 ) -> Iterator[Row]:
     """Shade every sample that shows something: by default as much as the effect's row says.
 
+    Each is lit by the environment that it was rendered under. Where the references' error is known,
+    the figure `noise` is what of the DSSIM it explains (`judging.floor`).
+
     Raises:
         DataError: no sample does.
         EngineError: this machine or this bundle lacks the backend.
@@ -137,6 +140,8 @@ def evaluate(
         figures = compare(ours, truth, nothing)
         if effect.is_light:
             figures["smape"] = judging.relative(reference, image)
+        if (error := data.error(number)) is not None:
+            figures["noise"] = judging.floor(effect, reference, error)
         guide = (
             pictures.normals(sample["normal"])
             if "normal" in sample
@@ -169,7 +174,7 @@ def compare(image: Image, reference: Image, trivial: Image) -> dict[str, float]:
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """Means over rows, and the ratio of mean DSSIM to the trivial answer's."""
-    names = rows[0].figures
+    names = [name for name in rows[0].figures if all(name in row.figures for row in rows)]
     mean = {name: float(np.mean([row.figures[name] for row in rows])) for name in names}
     return {"views": len(rows), **mean, "ratio": mean["dssim"] / mean["trivial_dssim"]}
 

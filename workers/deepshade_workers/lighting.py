@@ -16,7 +16,7 @@ import numpy as np
 
 from deepshade.camera import Camera
 from deepshade_workers.backend import mitsuba
-from deepshade_workers.sampling import pixel_streams, random_pair, strata
+from deepshade_workers.sampling import pixel_streams, random_pair, split, strata
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, eye_of, material, normals_toward, offset_origin, trace
 from deepshade_workers.view import Image, Light, Vector, View
@@ -118,7 +118,7 @@ def leaving(
     phong = Phong.at(scene, view, surface, valid, ns, toward)
     start = offset_origin(surface.p, ng, scene)
     part, whole = mi.Color3f(0), mi.Color3f(0)
-    for light in _lights(scene, view, surface, valid, start, phong.frame, first, second):
+    for light in _lights(scene, view, surface, valid, start, phong, first, second):
         local = phong.frame.to_local(light.direction)
         seen = valid & (local.z > 0) & (dr.max(light.radiance) > 0)
         reach = dr.select(light.distance < dr.inf, light.distance * (1 - 1e-4), FARTHEST)
@@ -217,14 +217,14 @@ def _lights(
     surface: Any,
     valid: Any,
     start: Any,
-    frame: Any,
+    phong: Phong,
     first: Any,
     second: Any,
 ) -> list[Arriving]:
     if view.light is not None:
         light = view.light
         lamp = _lamp(light.position, light.size, light.intensity, start, first)
-        return [lamp, _skylight(light, frame, second)]
+        return [lamp, _skylight(light, phong, second)]
     emitters = _emitters(scene, surface, valid, start, first)
     if scene.lit:
         return [emitters]
@@ -279,11 +279,20 @@ def _lamp(position: Vector, size: float, intensity: Vector, start: Any, pair: An
     return Arriving(direction, near, brightness * 2 / (dr.square(distance) * (1 + cosine)))
 
 
-def _skylight(light: Light, frame: Any, pair: Any) -> Arriving:
-    """The sky in a cosine-weighted direction."""
+def _skylight(light: Light, phong: Phong, pair: Any) -> Arriving:
+    """The sky, in a cosine-weighted direction or one of a glossy surface's lobe.
+
+    Either counts by the density of the mixture (the balance heuristic: Veach and Guibas, 1995).
+    Cosines alone would seldom find a narrow lobe, and then count for hundreds.
+    """
+    shine = dr.max(phong.specular)
+    glossy = dr.select(shine > 0, shine / (shine + dr.max(phong.diffuse)), 0)
+    shines, x = split(pair.x, glossy)
+    pair = mi.Point2f(x, pair.y)
     local = mi.warp.square_to_cosine_hemisphere(pair)
-    direction = frame.to_world(local)
-    density = local.z * dr.inv_pi
+    local = dr.select(shines, phong.sample_shine(pair), local)
+    direction = phong.frame.to_world(local)
+    density = dr.lerp(local.z * dr.inv_pi, phong.shine_density(local), glossy)
     radiance = dr.select(local.z > 0, _gradient(light, direction) / density, 0)
     return Arriving(direction, mi.Float(dr.inf), radiance)
 

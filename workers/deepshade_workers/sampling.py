@@ -18,7 +18,7 @@ from deepshade_workers.backend import mitsuba
 mi = mitsuba()
 
 # Of samples: more make an error more certain, fewer have more strata.
-GROUPS = 16
+GROUPS = 8
 _BELOW_1 = 1 - 2.0**-24  # the largest float32 that is
 
 
@@ -63,6 +63,11 @@ def strata(samples: int) -> tuple[int, int]:
         if cells % rows == 0 and cells // rows <= 4 * rows:
             return cells // rows, rows
     return cells // side, side
+
+
+def group_strata(samples: int) -> tuple[int, int]:
+    """Columns and rows of the grid that each pair has in a group of `hypercube_mean`."""
+    return strata(2 * max(1, samples // GROUPS))
 
 
 def rays_used(samples: int) -> int:
@@ -126,7 +131,7 @@ def hypercube_mean(
     of its own (Latin hypercube sampling: McKay, Beckman and Conover, Technometrics 21, 1979). The
     groups are independent, so that their spread gives an unbiased variance of the mean.
     """
-    columns, rows = strata(2 * max(1, samples // GROUPS))
+    columns, rows = group_strata(samples)
     cells = columns * rows
     stream = pixel_streams(pixels, seed)
     wide = dr.opaque(mi.UInt32, columns)

@@ -25,7 +25,8 @@ class Piece:
 
 def split(model: Any, float32: Sequence[str] = (), after: Sequence[str] = ()) -> list[Piece]:
     """The graph's pieces: up to the tensors named in `float32`, from there to those in `after`,
-    and the rest. One without names.
+    and the rest; again by turns where names in `float32` depend on some in `after`. One without
+    names.
 
     Where a graph begins by taking some channels of the picture, those become inputs of its own:
     they lie one after the other in memory, and to take them inside is to copy them. `model`,
@@ -36,8 +37,8 @@ def split(model: Any, float32: Sequence[str] = (), after: Sequence[str] = ()) ->
 
     pieces: list[Piece] = []
     known: list[str] = []
-    marks = [(names, exact) for names, exact in ((float32, True), (after, False)) if names]
-    for names, exact in [*marks, ((), bool(after))]:
+    stages: list[tuple[Sequence[str], bool]] = _stages(model, float32, after)
+    for names, exact in [*stages, ((), bool(after))]:
         part = model.clone()
         outputs = _tensors(part, names) or [node.input_value(0) for node in part.get_results()]
         entries = {_name(node): node for node in part.get_parameters()[1:]}
@@ -49,6 +50,36 @@ def split(model: Any, float32: Sequence[str] = (), after: Sequence[str] = ()) ->
         pieces.append(_piece(outputs, _views(part), entries, tuple(names), exact))
         known += names
     return pieces
+
+
+def _stages(
+    model: Any, float32: Sequence[str], after: Sequence[str]
+) -> list[tuple[Sequence[str], bool]]:
+    """The names by turns, exact ones first: each group depends on none of a later one."""
+    names = [*float32, *after]
+    makers = dict(zip(names, (out.get_node() for out in _tensors(model, names)), strict=True))
+    upstream = {name: _upstream([maker]) for name, maker in makers.items()}
+    left, exact, found = {True: list(float32), False: list(after)}, True, []
+    while left[True] or left[False]:
+        others = {_name(makers[name]) for name in left[not exact]}
+        ready = [n for n in left[exact] if not upstream[n] & (others - {_name(makers[n])})]
+        if ready:
+            found.append((ready, exact))
+            left[exact] = [name for name in left[exact] if name not in ready]
+        exact = not exact
+    return found
+
+
+def _upstream(nodes: list[Any]) -> set[str]:
+    """The names of nodes and all that they depend on."""
+    met: set[str] = set()
+    todo = list(nodes)
+    while todo:
+        node = todo.pop()
+        if _name(node) not in met:
+            met.add(_name(node))
+            todo += _sources(node)
+    return met
 
 
 def _tensors(model: Any, names: Sequence[str]) -> list[Any]:
@@ -99,13 +130,7 @@ def _piece(
     """What gives `outputs`, with those of the `views` and then of the `entries` that it needs."""
     from openvino import Model
 
-    met: set[str] = set()
-    todo = [output.get_node() for output in outputs]
-    while todo:
-        node = todo.pop()
-        if _name(node) not in met:
-            met.add(_name(node))
-            todo += _sources(node)
+    met = _upstream([output.get_node() for output in outputs])
     used = [view for name, view in views.items() if name in met]
     taken = {name: node for name, node in entries.items() if _name(node) in met}
     model = Model(outputs, [node for node, _ in used] + list(taken.values()), "piece")

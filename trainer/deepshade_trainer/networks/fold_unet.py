@@ -114,15 +114,18 @@ class FoldUNet(Network):
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.bias, config.bias)  # type: ignore[arg-type]
 
-    def forward(self, gbuffer: Tensor) -> Tensor:
-        """See `Network.forward`."""
+    def forward(self, gbuffer: Tensor, first: int = 0) -> Tensor:
+        """See `Network.forward`.
+
+        Geometric inputs that end in positions may begin at the channel `first` of many.
+        """
         config = self.config
-        x = self._stem(gbuffer)  # (N, widths[0], H / fold, W / fold)
+        x = self._stem(gbuffer, first)  # (N, widths[0], H / fold, W / fold)
         told: list[Tensor] = []
         masks: list[Tensor | None] = [None] * len(config.widths)
         if self.geometric:
             with full_precision():
-                near, nearest, told, masks = self.features(gbuffer)
+                near, nearest, told, masks = self.features(gbuffer, first)
             x = x + self.horizon(near)
             if nearest is not None:
                 x = x + self.detail(nearest)
@@ -142,12 +145,12 @@ class FoldUNet(Network):
             x = self.head(x.to(self.head.weight.dtype)).float()  # (N, outputs fold², h, w)
             return F.pixel_shuffle(x, config.fold)  # (N, outputs, H, W)
 
-    def _stem(self, gbuffer: Tensor) -> Tensor:
+    def _stem(self, gbuffer: Tensor, first: int) -> Tensor:
         """All but positions, folded: (N, C, H, W) to (N, widths[0], H / fold, W / fold)."""
         raw, weight, place = gbuffer, self.stem.weight, self.config.position or 0
-        if self.geometric and place + 3 == gbuffer.shape[1]:
+        if self.geometric and place + 3 == self.config.inputs:
             # All that is raw comes first. An odd number of channels would be slower in 16 bits.
-            raw = gbuffer[:, : place + place % 2]
+            raw = gbuffer[:, first : first + place + place % 2]
             if weight.shape[1] < raw.shape[1]:
                 weight = F.pad(weight, (0, 0, 0, 0, 0, 1))
         elif self.geometric:
@@ -161,7 +164,7 @@ class FoldUNet(Network):
             self.stem.weight = nn.Parameter(F.pad(self.stem.weight, (0, 0, 0, 0, 0, 1)))
 
     def features(
-        self, gbuffer: Tensor
+        self, gbuffer: Tensor, first: int = 0
     ) -> tuple[Tensor, Tensor | None, list[Tensor], list[Tensor | None]]:
         """What the positions of a G-buffer (N, inputs, H, W) tell, all in float32.
 
@@ -171,9 +174,10 @@ class FoldUNet(Network):
         geometry (N, 1, h, w), or None.
         """
         config = self.config
-        start, place = config.normal or 0, config.position or 0
-        six = gbuffer
-        if (start, place, gbuffer.shape[1]) != (0, 3, 6):
+        start, place = (first + (at or 0) for at in (config.normal, config.position))
+        if place == start + 3:
+            six = gbuffer if gbuffer.shape[1] == 6 else gbuffer[:, start : start + 6]
+        else:
             six = torch.cat([gbuffer[:, start : start + 3], gbuffer[:, place : place + 3]], 1)
         # One pixel stands for its cell. A mean would lie in the air where a cell shows an edge.
         nearest = None

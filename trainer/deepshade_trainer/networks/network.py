@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from deepshade.errors import ConfigError
-from deepshade_trainer.networks.receptive_field import Span
+from deepshade_trainer.networks.receptive_field import Span, halo
 
 
 class Network(nn.Module, ABC):
@@ -42,11 +42,7 @@ class Network(nn.Module, ABC):
     @property
     def halo(self) -> int:
         """How many pixels away an input may change an output, at most: exact, by construction."""
-        reach = 0
-        for pixel in range(self.size_multiple):
-            first, last = self.receptive_field(pixel)
-            reach = max(reach, pixel - first, last - pixel)
-        return reach
+        return halo(self.receptive_field, self.size_multiple)
 
     def prepare_export(self) -> None:
         """Lay the weights out as engines like them best; the answer stays."""

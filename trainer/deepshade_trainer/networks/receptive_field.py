@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 # First and last.
 Span = tuple[int, int]
 
@@ -24,3 +26,12 @@ def folded(span: Span, factor: int) -> Span:
 def joined(a: Span, b: Span) -> Span:
     """The run that holds both."""
     return min(a[0], b[0]), max(a[1], b[1])
+
+
+def halo(field: Callable[[int], Span], period: int) -> int:
+    """How many pixels away an input may change an output, at most.
+
+    `field` gives the input columns that an output column depends on, alike every `period` columns.
+    """
+    ends = ((pixel, field(pixel)) for pixel in range(period))
+    return max(max(pixel - first, last - pixel) for pixel, (first, last) in ends)

@@ -32,6 +32,10 @@ class Reflections(nn.Module):
     surface stands the environment behind it; where the view isn't known there, its mean.
     """
 
+    rounded = ()  # see `Network`: nothing may be
+    size_multiple = 1
+    halo = 0
+
     fits: Tensor
     row: Tensor
     column: Tensor
@@ -74,6 +78,9 @@ class Reflections(nn.Module):
         shine = torch.where(surface, specular, 1) * (share.clamp_min(0) * seen)
         spread = self._look(table, _angles(normal), self.row[1], self.column[1], self.rows[1])
         return diffuse * spread + shine
+
+    def prepare_export(self) -> None:
+        """See `Network.prepare_export`."""
 
     def _fit(self, mu: Tensor, gloss: Tensor) -> Tensor:
         """(1, 4 or 5, H, W): see `phong.table`."""

@@ -76,7 +76,7 @@ class Shader(nn.Module):
             F.pad(
                 gbuffer[:, place],
                 (0, width, 0, height),
-                "replicate" if ATTRIBUTES[name].in_background else "constant",
+                "replicate" if ATTRIBUTES[name].goes_on else "constant",
             )
             for name, place in self.places.items()
         ]

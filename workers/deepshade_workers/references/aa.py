@@ -12,7 +12,7 @@ import drjit as dr
 
 from deepshade_workers.backend import mitsuba
 from deepshade_workers.lighting import prepare, seen_along
-from deepshade_workers.sampling import stratified_mean
+from deepshade_workers.sampling import hypercube_mean
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, eye_of, pixel_rays, turn_to_world
 from deepshade_workers.view import Image, Images, View
@@ -44,5 +44,5 @@ def reference(
         return seen_along(scene, view, mi.Ray3f(eye, direction), first, second)
 
     count = max(samples, LEAST_SAMPLES)
-    value, error = stratified_mean(within, len(hits.valid), count, seed ^ STREAM)
+    value, error = hypercube_mean(within, len(hits.valid), count, seed ^ STREAM)
     return hits.planar(value), hits.planar(error)

@@ -12,7 +12,7 @@ import drjit as dr
 
 from deepshade_workers.backend import mitsuba
 from deepshade_workers.lighting import prepare, seen_along
-from deepshade_workers.sampling import stratified_mean
+from deepshade_workers.sampling import hypercube_mean
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, eye_of, pixel_rays, turn_to_world
 from deepshade_workers.view import Image, Images, View
@@ -39,7 +39,7 @@ def reference(
         disc = mi.warp.square_to_uniform_disk_concentric(point)
         return seen_along(scene, view, lens_ray(view, centers, disc), first, second)
 
-    value, error = stratified_mean(through_lens, len(hits.valid), samples, seed ^ STREAM)
+    value, error = hypercube_mean(through_lens, len(hits.valid), samples, seed ^ STREAM)
     return hits.planar(value), hits.planar(error)
 
 

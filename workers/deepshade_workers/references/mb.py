@@ -12,7 +12,7 @@ import drjit as dr
 
 from deepshade_workers.backend import mitsuba
 from deepshade_workers.lighting import prepare, seen_at
-from deepshade_workers.sampling import strata, stratified_mean
+from deepshade_workers.sampling import group_strata, hypercube_mean
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, eye_of, pixel_rays, turn_to_world
 from deepshade_workers.view import Image, Images, View
@@ -43,7 +43,7 @@ def reference(
     eye = eye_of(view.camera)
     centers = pixel_rays(view.camera, hits.width, hits.height)
     direction = dr.normalize(turn_to_world(view.camera, centers))
-    rows = dr.opaque(mi.Float, strata(samples)[1])
+    rows = dr.opaque(mi.Float, group_strata(samples)[1])
 
     def at_a_time(point: Any, first: Any, second: Any) -> Any:
         # Rows after one another make of the square's strata as many of time.
@@ -56,5 +56,5 @@ def reference(
             surface = dr.select(found.t < surface.t, found, surface)
         return seen_at(scene, view, mi.Ray3f(eye, direction), surface, first, second)
 
-    value, error = stratified_mean(at_a_time, len(hits.valid), samples, seed ^ STREAM)
+    value, error = hypercube_mean(at_a_time, len(hits.valid), samples, seed ^ STREAM)
     return hits.planar(value), hits.planar(error)

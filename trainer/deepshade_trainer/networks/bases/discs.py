@@ -85,7 +85,10 @@ class Discs(Bases):
 
     def features(self, gbuffer: Tensor) -> tuple[Tensor, State]:
         """See `Bases.features`."""
-        focal, light = gbuffer[:, :1], gbuffer[:, 1:]
+        return self.spread(gbuffer[:, :1], gbuffer[:, 1:])
+
+    def spread(self, focal: Tensor, light: Tensor) -> tuple[Tensor, State]:
+        """`features` of blur circles (N, 1, H, W) and light (N, 3, H, W)."""
         # (N, 1, 2, H, W), before and behind the focus: engines would pad 2 channels to 8
         radius = F.relu(focal[:, None] * self.sides[:, None])
         share = (radius / _RADII[0]).clamp(max=1) + self.least[:, None]
