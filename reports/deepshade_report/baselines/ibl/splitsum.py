@@ -98,16 +98,18 @@ def open_surface(mips: int, view: View) -> Surface:
     before = np.searchsorted(octaves[1:-1], np.arange(OCTAVES + 1), side="right")
     begins = np.array(octaves)[before]
     gaps = 1 / (np.array(octaves)[before + 1] - begins)
-    directions = (
-        mi.Vector3f(*(plain(plane) for plane in view.attributes[name]))
-        for name in ("normal_world", "view")
+    planes = view.attributes
+    normal, toward = (
+        mi.Vector3f(*(plain(plane) for plane in planes[name])) for name in ("normal_world", "view")
     )
     lit = require(view)
     turned = projected(lit.environment, world_to_map(lit.degrees, lit.up))[:, :9].T
     return Surface(
-        *directions,
-        *(light(view.attributes[name]) for name in ("diffuse", "specular")),
-        plain(view.attributes["gloss"][0]),
+        normal,
+        toward,
+        light(planes["diffuse"]),
+        light(planes["specular"]),
+        plain(planes["gloss"][0]),
         open_chain(view, [*(octave + 1 for octave in octaves[:-1]), MIRROR]),
         [colour(value) for value in turned],
         mi.Float(_albedo()),
