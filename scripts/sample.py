@@ -1,19 +1,21 @@
-"""Renders samples/room.exr: a G-buffer with everything that nine effects need, and their references.
+"""Renders samples/room.exr: a G-buffer with what nine effects need, and their references.
 
     python scripts/sample.py
 
-About half an hour on two cores. Small enough to ship: what follows from the depth and the camera is left
-out, and light and references are half floats.
+About half an hour on two cores. Small enough to ship: what follows from the depth and the camera is
+left out; light and references are half floats, of which no more bits are kept than their noise
+leaves any meaning.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deepshade import environments, exr
-from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS
 from deepshade_workers.environments import EnvironmentLight
@@ -21,9 +23,12 @@ from deepshade_workers.render import channels_of, render_sample
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.view import Light, View
 
+Float = NDArray[np.float32]
+
 SCENE, WIDTH, HEIGHT = "procedural:room:7", 512, 384
 EYE, TARGET = (1.4, 1.6, 1.4), (-0.8, 0.6, -0.8)
 SAMPLES, AO_SAMPLES = 512, 1024  # rays a pixel
+BITS = {"light": 7, "reference": 6}  # that are kept behind the point: 0.4 and 0.8 %
 SHIPPED = (
     *("depth", "normal", "diffuse", "specular", "gloss", "scatter"),
     *("motion", "light", "light_diffuse"),
@@ -47,7 +52,7 @@ def view() -> View:
 def main() -> None:
     """Render and write."""
     scene, seen = open_scene(SCENE), view()
-    images: dict[str, np.ndarray] = {}
+    images: dict[str, Float] = {}
     for effects, samples in ((tuple(EFFECTS), SAMPLES), (("ao",), AO_SAMPLES)):
         images |= render_sample(
             *(scene, seen, WIDTH, HEIGHT),
@@ -56,18 +61,31 @@ def main() -> None:
             samples=samples,
             seed=0,
         )
+    write(images, seen)
+
+
+def write(images: Mapping[str, Float], seen: View) -> None:
+    """The file, of what was rendered."""
     channels = {
-        name: plane
-        for name, plane in channels_of(images, SHIPPED, EFFECTS).items()
+        name: coarse(plane, BITS.get(name.partition("_")[0].partition(".")[0], 10))
+        for name, plane in channels_of(dict(images), SHIPPED, EFFECTS).items()
         if "_error" not in name
     }
-    exact = ATTRIBUTES["depth"].channels
+    channels["Z"] = images["depth"][0]
     exr.write(
         Path("samples/room.exr"),
         channels,
-        half=[name for name in channels if name not in exact],
+        half=[name for name in channels if name != "Z"],
         attributes={**seen.header(), "deepshade:scene": SCENE, "deepshade:spp": SAMPLES},
     )
+
+
+def coarse(plane: Float, kept: int) -> Float:
+    """Half floats rounded to so many bits behind the point; they have 10."""
+    unit = 1 << (10 - kept)
+    bits = plane.astype(np.float16).view(np.uint16) + np.uint16(unit // 2)
+    rounded = bits & np.uint16(0x10000 - unit)
+    return rounded.view(np.float16).astype(np.float32)
 
 
 if __name__ == "__main__":

@@ -91,6 +91,13 @@ class View:
         names = [name for name in self.effect.inputs if ATTRIBUTES[name].unit is RADIANCE]
         return self.attributes[names[0]] if names else None
 
+    @property
+    def origin(self) -> str | None:
+        """What `light` is, for a page."""
+        if "environment" in self.effect.settings:
+            return "doing nothing"
+        return None if self.light() is None else "light"
+
     def floor(self) -> float | None:
         """What noise in the reference leaves (`judging.floor`); None where no error is known."""
         if self.error is None:
