@@ -27,7 +27,8 @@ Float = NDArray[np.float32]
 
 SCENE, WIDTH, HEIGHT = "procedural:room:7", 512, 384
 EYE, TARGET = (1.4, 1.6, 1.4), (-0.8, 0.6, -0.8)
-SAMPLES, AO_SAMPLES = 512, 1024  # rays a pixel
+RAYS = {"ao": 1024, "dof": 256, "mb": 256}  # a pixel, else
+SAMPLES = 512
 BITS = {"light": 7, "reference": 6}  # that are kept behind the point: 0.4 and 0.8 %
 SHIPPED = (
     *("depth", "normal", "diffuse", "specular", "gloss", "scatter"),
@@ -53,12 +54,12 @@ def main() -> None:
     """Render and write."""
     scene, seen = open_scene(SCENE), view()
     images: dict[str, Float] = {}
-    for effects, samples in ((tuple(EFFECTS), SAMPLES), (("ao",), AO_SAMPLES)):
+    for effect in EFFECTS:
         images |= render_sample(
             *(scene, seen, WIDTH, HEIGHT),
-            effects=effects,
+            effects=[effect],
             attributes=SHIPPED,
-            samples=samples,
+            samples=RAYS.get(effect, SAMPLES),
             seed=0,
         )
     write(images, seen)
