@@ -68,7 +68,7 @@ def chain(
         rings.Parameters(**tuned(f"{_BASELINES}.dof", "rings")),
     )
     settings = {"mips": mips, "slices": slices, "steps": steps, "rings": ring_count, "half": half}
-    name = "split sum, GTAO, ring gather"
+    name = "split sum + GTAO + ring gather"
     return Filter(name, settings, parameters, partial(_open, mips), _shade, recorded=True)
 
 
