@@ -133,7 +133,8 @@ def overview(found: dict[str, Figures]) -> list[str]:
 def nine(found: dict[str, Figures]) -> list[str]:
     """Markdown: a line for each effect, the paper's own figures beside what was measured here."""
     lines = [
-        "| | paper: SSIM | ms | doing nothing: SSIM | ours: SSIM | error | ms | best rival | error | ms |",
+        "| | paper: SSIM | ms | doing nothing: SSIM "
+        "| ours: SSIM | error | ms | best rival | error | ms |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for effect, each in found.items():
