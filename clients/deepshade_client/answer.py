@@ -25,14 +25,19 @@ class Answer:
     """A shaded picture as it was received.
 
     `content` is the file (`media_type` says EXR or PNG), `facts` what the service says about it
-    (bundle, radius, radius_source, derived, background_pixels, …), and `timing` the service's
-    milliseconds for each of its stages.
+    (bundle, radius, radius_source, derived, background_pixels, …; of several effects
+    "ao.bundle" and so on), and `timing` the service's milliseconds for each of its stages.
     """
 
     content: bytes
     media_type: str
     facts: Mapping[str, str]
     timing: Mapping[str, float]
+
+    @property
+    def effects(self) -> list[str]:
+        """The effects that it holds, in the order asked for."""
+        return self.facts.get("effects", self.facts.get("effect", "")).split(",")
 
     def save(self, path: Path | str) -> Path:
         """Write the file; whatever was there is replaced only when all is written."""
@@ -44,7 +49,8 @@ class Answer:
     def plan(self) -> dict[str, Any]:
         """How it was made, and why, as the EXR's header says; {} if it doesn't (as in a PNG).
 
-        The same as `Client.explain` gives. Raises BadAnswer when the file is damaged.
+        The same as `Client.explain` gives: for several effects a plan for each. Raises
+        BadAnswer when the file is damaged.
         """
         if self.media_type != "image/x-exr":
             return {}
@@ -58,12 +64,28 @@ class Answer:
     def channels(self) -> dict[str, NDArray[np.float32]]:
         """The decoded EXR: (H, W) float32 under "Y", or "R", "G" and "B".
 
-        Raises BadAnswer when it is a PNG or can't be decoded.
+        Of several effects each is a layer: "ao.Y", "gi.R" and so on. Raises BadAnswer when it is
+        a PNG or can't be decoded.
         """
         try:
             return exr.read(self.content).pixels
         except ImageError as error:
             raise BadAnswer(f"the answer ({self.media_type}) can't be decoded: {error}") from error
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """The decoded EXR by effect: (1, H, W) or (3, H, W) float32.
+
+        Raises what `channels` raises, and BadAnswer where an effect has no channel.
+        """
+        channels, effects = self.channels(), self.effects
+        found = {}
+        for effect in effects:
+            layer = f"{effect}." if len(effects) > 1 else ""
+            names = [name for name in (f"{layer}{band}" for band in "YRGB") if name in channels]
+            if not names:
+                raise BadAnswer(f"the answer holds no '{effect}', only {', '.join(channels)}")
+            found[effect] = np.stack([channels[name] for name in names])
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +102,22 @@ class Saved:
 
 
 def facts(headers: Mapping[str, str]) -> dict[str, str]:
-    """The Deepshade-* headers, as in "radius_source"."""
-    return {
+    """The Deepshade-* headers, as in "radius_source"; of several effects as in "ao.radius".
+
+    Raises BadAnswer when those of an effect can't be read.
+    """
+    found = {
         name[len(_PREFIX) :].lower().replace("-", "_"): value
         for name, value in headers.items()
         if name.lower().startswith(_PREFIX)
     }
+    for effect in filter(None, found.get("effects", "").split(",")):
+        try:
+            each = json.loads(found.pop(effect))
+            found |= {f"{effect}.{name}": str(value) for name, value in each.items()}
+        except (KeyError, ValueError, AttributeError) as error:
+            raise BadAnswer(f"the answer's header about '{effect}' can't be read") from error
+    return found
 
 
 def timing(value: str) -> dict[str, float]:

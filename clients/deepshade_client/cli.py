@@ -33,7 +33,9 @@ AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output on
 
 @app.command()
 def shade(
-    effect: Annotated[str, typer.Argument(help="Which effect, for example ao.")],
+    effect: Annotated[
+        str, typer.Argument(help="Which effect, as ao; or several, as ao,gi: a layer each.")
+    ],
     inputs: Annotated[
         list[str], typer.Argument(metavar="IN...", help="EXR files, folders, glob patterns.")
     ],
@@ -155,7 +157,7 @@ def shade(
 
 @app.command()
 def effects(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
-    """List the effects, their inputs, and which of them the service can shade."""
+    """List the effects: their inputs, their settings with ranges, and the service's bundles."""
     from deepshade_client.report import print_effects
 
     found = _effects(server)

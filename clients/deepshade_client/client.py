@@ -15,6 +15,7 @@ from deepshade.files import replacing
 from deepshade_client.answer import Answer, Saved
 from deepshade_client.exceptions import ClientError
 from deepshade_client.request import (
+    Effects,
     Options,
     Picture,
     base_url,
@@ -55,15 +56,16 @@ class Client:
             transport=transport,
         )
 
-    def shade(self, effect: str, picture: Picture, options: Options | None = None) -> Answer:
+    def shade(self, effect: Effects, picture: Picture, options: Options | None = None) -> Answer:
         """Shade a picture: a file, its bytes, several files of one view, or attribute -> file.
 
+        Several effects ("ao,gi" or a list) are one request and one answer: see `Answer.arrays`.
         Also raises OSError for a file that can't be read.
         """
         return self._ask(shade_request(effect, picture, options), read_answer)
 
     def shade_to(
-        self, path: Path | str, effect: str, picture: Picture, options: Options | None = None
+        self, path: Path | str, effect: Effects, picture: Picture, options: Options | None = None
     ) -> Saved:
         """Like `shade`, but the answer goes to a file as it arrives, and memory holds none of it.
 
@@ -73,17 +75,18 @@ class Client:
         return self._try(lambda: self._save(Path(path), request))
 
     def explain(
-        self, effect: str, picture: Picture, options: Options | None = None
+        self, effect: Effects, picture: Picture, options: Options | None = None
     ) -> dict[str, Any]:
         """How the service would shade a picture, and why: its plan, without shading it.
 
+        For several effects a plan for each, by its name.
         Which bundle on which engine, what of the picture would be computed, which channels are
         read; docs/service.md has an example. Also raises OSError for a file that can't be read.
         """
         return self._ask(shade_request(effect, picture, options, explain=True), read_object)
 
     def effects(self) -> list[dict[str, Any]]:
-        """Every effect: name, title, inputs, outputs, and its bundles."""
+        """Every effect: name, title, inputs, outputs, settings with ranges, and its bundles."""
         return self._ask(get_request("effects"), read_list)
 
     def effect(self, name: str) -> dict[str, Any]:
@@ -169,20 +172,22 @@ class AsyncClient:
             transport=transport,
         )
 
-    async def shade(self, effect: str, picture: Picture, options: Options | None = None) -> Answer:
+    async def shade(
+        self, effect: Effects, picture: Picture, options: Options | None = None
+    ) -> Answer:
         """Like `Client.shade`; files are read in a thread."""
         request = await asyncio.to_thread(shade_request, effect, picture, options)
         return await self._ask(request, read_answer)
 
     async def shade_to(
-        self, path: Path | str, effect: str, picture: Picture, options: Options | None = None
+        self, path: Path | str, effect: Effects, picture: Picture, options: Options | None = None
     ) -> Saved:
         """Like `Client.shade_to`; files are read and written in threads."""
         request = await asyncio.to_thread(shade_request, effect, picture, options)
         return await self._try(lambda: self._save(Path(path), request))
 
     async def explain(
-        self, effect: str, picture: Picture, options: Options | None = None
+        self, effect: Effects, picture: Picture, options: Options | None = None
     ) -> dict[str, Any]:
         """Like `Client.explain`; files are read in a thread."""
         request = await asyncio.to_thread(shade_request, effect, picture, options, explain=True)

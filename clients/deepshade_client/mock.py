@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable, Mapping
 
 import httpx
@@ -36,10 +37,18 @@ class MockTransport(httpx.MockTransport):
 def mock_answer(channels: Mapping[str, ArrayLike], **facts: object) -> httpx.Response:
     """The response of a service that shaded a picture: an EXR of (H, W) `channels`.
 
-    `facts` become its headers, as in `Answer.facts`: radius=2, radius_source="request".
+    `facts` become its headers, as in `Answer.facts`: radius=2, radius_source="request". Those of
+    several effects are mappings by name: mock_answer({"ao.Y": …, "gi.R": …, …},
+    ao={"bundle": "best"}, gi={"bundle": "fast"}).
     """
     stream = io.BytesIO()
     exr.write(stream, channels)
-    headers = {f"Deepshade-{name.replace('_', '-')}": str(fact) for name, fact in facts.items()}
+    several = [name for name, fact in facts.items() if isinstance(fact, Mapping)]
+    if several:
+        facts = {"effects": ",".join(several)} | facts
+    headers = {
+        f"Deepshade-{name.replace('_', '-')}": json.dumps(fact) if name in several else str(fact)
+        for name, fact in facts.items()
+    }
     headers["Content-Type"] = "image/x-exr"
     return httpx.Response(200, content=stream.getvalue(), headers=headers)

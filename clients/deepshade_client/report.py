@@ -43,16 +43,43 @@ def as_json(tasks: Sequence[Task], results: Sequence[Result]) -> dict[str, Any]:
 
 
 def print_effects(effects: Sequence[dict[str, Any]]) -> None:
-    """A table of effects."""
-    table = Table("effect", "title", "inputs", "bundles")
+    """What each effect reads, its settings, and its bundles with their error and time."""
+    console = Console()
     for effect in effects:
-        table.add_row(
-            effect["name"],
-            effect["title"],
-            ", ".join(entry["attribute"] for entry in effect["inputs"]),
-            ", ".join(bundle["name"] for bundle in effect["bundles"]) or "[dim]none[/dim]",
-        )
-    Console().print(table)
+        console.print(f"[bold]{escape(effect['name'])}[/bold]  {escape(effect['title'])}")
+        table = Table.grid("", "", "", padding=(0, 2))
+        table.add_row("  reads", "", ", ".join(entry["attribute"] for entry in effect["inputs"]))
+        for setting in effect["settings"]:
+            table.add_row(f"  --{setting['name']}", escape(_range(setting)), _meaning(setting))
+        for bundle in effect["bundles"]:
+            on = f"{bundle['engine']}/{bundle['precision']}"
+            error = f"DSSIM {bundle['dssim']:.4f}" if bundle["dssim"] is not None else ""
+            table.add_row(f"  {escape(bundle['name'])}", error, escape(_times(bundle, on)))
+        if not effect["bundles"]:
+            table.add_row("  [dim]no bundle[/dim]")
+        console.print(table)
+
+
+def _range(setting: dict[str, Any]) -> str:
+    if setting["lowest"] is None:
+        return str(setting["unit"])
+    return f"{setting['unit']}, {setting['lowest']:g} to {setting['highest']:g}"
+
+
+def _meaning(setting: dict[str, Any]) -> str:
+    """What it is, and what holds without it."""
+    default = setting["default"]
+    shown = f"{default:g}" if isinstance(default, int | float) else default
+    without = ", else ".join(str(each) for each in (setting["header"], shown) if each is not None)
+    return escape(f"{setting['meaning']}; without it {without}")
+
+
+def _times(bundle: dict[str, Any], on: str) -> str:
+    times = [
+        f"{each['ms']:.3g} ms at {each['size'][0]} x {each['size'][1]} ({each['machine']})"
+        for each in bundle.get("times", ())
+    ]
+    return f"{on}: {'; '.join(times)}" if times else on
 
 
 def print_environments(environments: Sequence[dict[str, Any]]) -> None:
@@ -85,11 +112,15 @@ def _line(result: Result) -> str:
     facts, timing = result.saved.facts, result.saved.timing
     parts = [f"[green]✓[/green] {escape(str(result.task.target))}  {result.seconds:.2f} s"]
     if timing:
-        parts.append(" ".join(f"{name} {ms:.0f}" for name, ms in timing.items()) + " ms")
-    if facts.get("derived"):
-        parts.append(f"derived {escape(facts['derived'])}")
-    if facts.get("nonfinite_pixels", "0") != "0":
-        parts.append(f"[yellow]{facts['nonfinite_pixels']} non-finite pixels[/yellow]")
+        # of several effects the sums: "infer-ao" and such are in the JSON
+        sums = (f"{name} {ms:.0f}" for name, ms in timing.items() if "-" not in name)
+        parts.append(f"{' '.join(sums)} ms")
+    derived = {value: None for name, value in facts.items() if name.endswith("derived") and value}
+    if derived:
+        parts.append(f"derived {escape('; '.join(derived))}")
+    broken = {n for name, n in facts.items() if name.endswith("nonfinite_pixels")} - {"0"}
+    if broken:
+        parts.append(f"[yellow]{', '.join(sorted(broken))} non-finite pixels[/yellow]")
     return "  ·  ".join(parts)
 
 

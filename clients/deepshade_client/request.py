@@ -31,6 +31,7 @@ T = TypeVar("T")
 
 Source = Path | str | bytes
 Picture = Source | Sequence[Source] | Mapping[str, Source]
+Effects = str | Sequence[str]  # "ao", "ao,gi" or ["ao", "gi"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +76,7 @@ class Options:
 
 
 def shade_request(
-    effect: str, picture: Picture, options: Options | None, *, explain: bool = False
+    effects: Effects, picture: Picture, options: Options | None, *, explain: bool = False
 ) -> dict[str, Any]:
     """The arguments of httpx's `request`; reads the files. With `explain` it asks for the plan.
 
@@ -84,7 +85,8 @@ def shade_request(
     query = (options or Options()).query()
     if explain:
         query.append(("explain", "true"))
-    request = {"method": "POST", "url": f"shade/{quote(effect, safe='')}", "params": query}
+    names = effects if isinstance(effects, str) else ",".join(effects)
+    request = {"method": "POST", "url": f"shade/{quote(names, safe=',')}", "params": query}
     if isinstance(picture, (str, bytes, Path)):
         _, data = _named(picture)
         return request | {"content": data, "headers": {"Content-Type": EXR}}

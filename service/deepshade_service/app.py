@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from collections.abc import AsyncIterator, Awaitable
 from contextlib import asynccontextmanager, suppress
@@ -15,23 +16,24 @@ from fastapi.responses import HTMLResponse, PlainTextResponse
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
-from deepshade.effects import EFFECTS
+from deepshade.effects import EFFECTS, SETTINGS, Effect, Setting
 from deepshade.engines import Engine
 from deepshade.errors import EngineError
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade_service import environment_routes as routes
 from deepshade_service import problems
+from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
-from deepshade_service.environments import Environments
+from deepshade_service.environments import SHARE, Environments
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
-from deepshade_service.models import Models, find_effect, not_ready
+from deepshade_service.models import Models, find_effect, find_effects, not_ready
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.selection import allowed
-from deepshade_service.shading import Shaded, Shader
+from deepshade_service.shading import Shader
 from deepshade_service.telemetry import MEDIA_TYPE as METRICS_TYPE
-from deepshade_service.telemetry import Telemetry
+from deepshade_service.telemetry import Telemetry, server_timing
 from deepshade_service.uploads import Uploads
 from deepshade_service.workers import Cancelled, Workers
 
@@ -46,7 +48,11 @@ class Service:
         self.workers = Workers(settings.workers, settings.queue)
         self.uploads = Uploads(settings)
         self.memory = MemoryBudget(settings.memory)
-        self.environments = Environments(settings.environments, environment_limits(settings.limits))
+        self.environments = Environments(
+            settings.environments,
+            environment_limits(settings.limits),
+            int(SHARE * settings.memory),
+        )
         self.shader = Shader(
             self.models, self.workers, self.memory, settings.limits, self.environments
         )
@@ -66,9 +72,11 @@ class Service:
             await self.workers.stop()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def shade(self, effect: str, request: Request, asked: ShadeParameters) -> Shaded:
-        """Receive, queue and shade one picture."""
-        candidates = allowed(self.models, effect, asked)
+    async def shade(self, names: str, request: Request, asked: ShadeParameters) -> Shaded:
+        """Receive, queue and shade one picture, by one effect or a list as "ao,gi"."""
+        effects = find_effects(names)
+        candidates = [allowed(self.models, effect.name, asked) for effect in effects]
+        asked.check(effects)
         if asked.environment is not None:
             self.environments.check(asked.environment)
         self.workers.check_place()  # before the body is received, to spare both sides the work
@@ -76,9 +84,11 @@ class Service:
             with self.workers.place():
                 work = self.shader.shade(files, asked, candidates)
                 shaded = await _unless_gone(request, work)
-        if not asked.explain:
-            nonfinite = int(shaded.facts["nonfinite_pixels"])
-            self.telemetry.shaded(effect, shaded.watch, shaded.pixels, shaded.computed, nonfinite)
+        for made in () if asked.explain else shaded.made:
+            shared = {name: ms / len(shaded.made) for name, ms in shaded.milliseconds.items()}
+            nonfinite = int(made.facts["nonfinite_pixels"])
+            stages = {**shared, **made.milliseconds}
+            self.telemetry.shaded(made.effect, stages, made.pixels, made.computed, nonfinite)
         return shaded
 
     async def _tidy(self) -> None:
@@ -103,7 +113,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lifespan=service.running,
     )
     app.state.service = service
-    problems.install(app)
+    problems.install(app, ShadeParameters.model_fields)
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
 
@@ -124,13 +134,16 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         headers, and its EXR header, say how it was made. With `explain=1` the answer is the plan
         as JSON: which bundle on which engine and why, what of the picture would be computed, and
         which channels were decoded for it.
+
+        `effect` may be a list, as `ao,gi`: one decode, and one EXR in which each is a layer
+        (`ao.Y`, `gi.R`). A setting counts for all that have it, and so does what chooses a bundle.
         """
         try:
             answer = await service.shade(effect, request, asked)
         except Cancelled:
             return Response(status_code=503)  # nobody is there to read it
         headers = {_header_name(name): _header_value(v) for name, v in answer.facts.items()}
-        headers["Server-Timing"] = answer.watch.server_timing()
+        headers["Server-Timing"] = server_timing(answer.stages)
         return Response(answer.content, media_type=answer.media_type, headers=headers)
 
     @app.get("/effects", tags=["effects"], summary="All effects and their bundles")
@@ -212,8 +225,24 @@ def _effect(name: str, models: Models) -> dict[str, Any]:
         "outputs": effect.outputs,
         "reference": effect.reference,
         "background": effect.background,
-        "settings": effect.settings,
+        "settings": [_setting(s, models, effect) for s in SETTINGS.values() if effect.takes(s)],
         "bundles": [_bundle(bundle, models) for bundle in models.bundles(name)],
+    }
+
+
+def _setting(setting: Setting, models: Models, effect: Effect) -> dict[str, Any]:
+    """Without it, what an image's `header` says counts, else the `default`."""
+    default = setting.default
+    if setting.name == "radius" and (bundles := models.bundles(effect.name)):
+        default = bundles[0].radius
+    return {
+        "name": setting.name,
+        "unit": setting.unit,
+        "meaning": setting.meaning,
+        "lowest": setting.lowest,
+        "highest": setting.highest,
+        "header": setting.header if setting.stored else None,
+        "default": default,
     }
 
 
@@ -231,8 +260,18 @@ def _bundle(bundle: Bundle, models: Models) -> dict[str, Any]:
         "engine": backend and backend.engine,
         "precision": backend and backend.precision,
         "dssim": bundle.dssim,
+        "times": _times(bundle, str(backend)),
         "metrics": bundle.metrics,
     }
+
+
+def _times(bundle: Bundle, backend: str) -> list[dict[str, Any]]:
+    """What the network was published to take on that backend: on which machine, for what size."""
+    return [
+        {"machine": machine, "size": found["size"], "ms": found["ms"][backend]}
+        for machine, found in bundle.metrics.get("speed", {}).items()
+        if backend in found["ms"]
+    ]
 
 
 def _header_name(fact: str) -> str:
@@ -240,7 +279,13 @@ def _header_name(fact: str) -> str:
 
 
 def _header_value(value: object) -> str:
-    """Printable ASCII: channel names come from strangers and may hold anything."""
+    """Printable ASCII: channel names come from strangers and may hold anything.
+
+    The facts of one effect among several are JSON: in a header for each there would be more
+    headers than many clients take.
+    """
+    if isinstance(value, dict):
+        return json.dumps({name: _header_value(fact)[:200] for name, fact in value.items()})
     text = f"{value:.9g}" if isinstance(value, float) else str(value)
     return "".join(c if " " <= c <= "~" else "?" for c in text)[:2000].strip()
 

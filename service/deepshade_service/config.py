@@ -46,7 +46,8 @@ class Settings:
     (twice their bytes) and wait; 0 is the default for this machine, or what the largest body needs.
     `engine` and `precision` pin what requests run on that pin nothing themselves; None leaves it
     to the rule (`deepshade.engines.choose`). `environments` is a folder of environment maps, into
-    which requests may add more if `environment_uploads`.
+    which requests may add more if `environment_uploads`; those prepared may take a quarter of
+    `memory` besides.
     """
 
     models: Path = field(default_factory=bundle_root)

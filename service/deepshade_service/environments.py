@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from deepshade import pictures
+from deepshade.effects import SETTINGS
 from deepshade.environments import SUFFIXES, Environment, Prepared, read_environment, sky
 from deepshade.environments.hdr import MAGIC
 from deepshade.errors import DeepshadeError, nearest
@@ -22,8 +23,8 @@ from deepshade_service.problems import Problem
 
 log = logging.getLogger("deepshade.service")
 
-DEFAULT = "sky"  # generated: it is there without a folder
-MAX_PREPARED = 4  # in memory, about 100 MB each; of others the one used longest ago goes
+DEFAULT = str(SETTINGS["environment"].default)  # generated: it is there without a folder
+SHARE = 0.25  # prepared maps may take so much of --memory, on top of it; one is always kept
 MAX_MAPS = 1024  # that uploads may add up to
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -31,10 +32,30 @@ _THUMBNAIL = 64  # rows
 _GREY = 0.35  # what a map's mean is shown as
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
+class _File:
+    """A map's file as it was when it was read; None is generated."""
+
+    path: Path | None
+    state: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, path: Path | None) -> _File:
+        """As it is now: when it was changed, its size, and which file it is."""
+        if path is None:
+            return cls(None, (0, 0, 0))
+        try:
+            found = path.stat()
+        except OSError:
+            return cls(path, (0, 0, 0))
+        return cls(path, (found.st_mtime_ns, found.st_size, found.st_ino))
+
+
+@dataclass(frozen=True, slots=True)
 class _Known:
     """What is known of a map since it was last read."""
 
+    file: _File
     sha256: str
     shape: tuple[int, int]
     thumbnail: bytes
@@ -43,16 +64,25 @@ class _Known:
 class Environments:
     """Maps by name: the files of a folder, and a generated sky.
 
-    Each is read and prepared when it is first asked for, and what is prepared is kept by its
-    hash. Only for use on the event loop; what blocks is done in threads.
+    Each is read and prepared when it is first asked for, and again when its file has changed.
+    What is prepared is kept by its hash, within `memory` bytes; of others the one used longest
+    ago goes. One is prepared at a time. Only for use on the event loop; what blocks is done in
+    threads.
     """
 
-    def __init__(self, folder: Path | None, limits: Limits) -> None:
+    def __init__(self, folder: Path | None, limits: Limits, memory: int) -> None:
         self.folder = folder
         self._limits = limits
+        self._memory = memory
+        self._preparing = asyncio.Lock()
         self._known: dict[str, _Known] = {}
         self._prepared: OrderedDict[str, Prepared] = OrderedDict()  # by sha256
         self._loading: dict[str, asyncio.Task[Prepared]] = {}
+
+    @property
+    def held(self) -> int:
+        """Bytes of what is prepared."""
+        return sum(prepared.bytes for prepared in self._prepared.values())
 
     def names(self) -> list[str]:
         """All maps, by name."""
@@ -78,7 +108,7 @@ class Environments:
         Raises Problem 422 for an unknown name, and what `read_environment` raises.
         """
         self.check(name)
-        known = self._known.get(name)
+        known = self._current(name)
         if known is not None and known.sha256 in self._prepared:
             self._prepared.move_to_end(known.sha256)
             return self._prepared[known.sha256]
@@ -100,15 +130,15 @@ class Environments:
             )
         if name not in self.names() and len(self.names()) >= MAX_MAPS:
             raise Problem(422, "too-many-environments", f"there are {MAX_MAPS} maps already")
-        environment = await asyncio.to_thread(read_environment, data, name, self._limits)
-        await asyncio.to_thread(self._write, name, data)
-        self._known.pop(name, None)
-        await self._keep(name, environment)
+        async with self._preparing:
+            environment = await asyncio.to_thread(read_environment, data, name, self._limits)
+            file = await asyncio.to_thread(self._write, name, data)
+            await self._keep(name, environment, file)
         return self.describe(name)
 
     async def thumbnail(self, name: str) -> bytes:
         """A small PNG of the map. Raises what `get` raises."""
-        if self.check(name, 404) not in self._known:
+        if self._current(self.check(name, 404)) is None:
             await self.get(name)
         return self._known[name].thumbnail
 
@@ -134,7 +164,15 @@ class Environments:
             if path.suffix.lower() in SUFFIXES and _NAME.fullmatch(path.stem)
         }
 
-    def _write(self, name: str, data: bytes) -> None:
+    def _current(self, name: str) -> _Known | None:
+        """What is known of a map, if its file is still the one that was read."""
+        known = self._known.get(name)
+        if known is None:
+            return None
+        file = _File.of(known.file.path or self._files().get(name))
+        return known if known.file == file else None
+
+    def _write(self, name: str, data: bytes) -> _File:
         assert self.folder is not None, "uploads need a folder"
         target = self.folder / f"{name}{'.hdr' if data.startswith(MAGIC) else '.exr'}"
         with replacing(target) as temporary:
@@ -142,22 +180,26 @@ class Environments:
         for suffix in SUFFIXES:
             if (other := target.with_suffix(suffix)) != target:
                 other.unlink(missing_ok=True)
+        return _File.of(target)
 
     async def _load(self, name: str) -> Prepared:
         try:
-            path = self._files().get(name)
-            if path is None:
-                environment = await asyncio.to_thread(sky, name, height=512)
-            else:
-                environment = await asyncio.to_thread(read_environment, path, "", self._limits)
-            return await self._keep(name, environment)
+            async with self._preparing:
+                file = _File.of(self._files().get(name))
+                if file.path is None:
+                    environment = await asyncio.to_thread(sky, name, height=512)
+                else:
+                    environment = await asyncio.to_thread(
+                        read_environment, file.path, "", self._limits
+                    )
+                return await self._keep(name, environment, file)
         except DeepshadeError as error:
             log.error("environment %s can't be used: %s", name, error)
             raise
         finally:
             del self._loading[name]
 
-    async def _keep(self, name: str, environment: Environment) -> Prepared:
+    async def _keep(self, name: str, environment: Environment, file: _File) -> Prepared:
         digest = environment.sha256
         if digest not in self._prepared:
             prepared = await asyncio.to_thread(Prepared.of, environment)
@@ -165,10 +207,12 @@ class Environments:
             log.info("environment %s (%s) is prepared", name, digest[:12])
         self._prepared.move_to_end(digest)
         picture = await asyncio.to_thread(_thumbnail, environment)
-        self._known[name] = _Known(digest, environment.shape, picture)
-        while len(self._prepared) > MAX_PREPARED:
+        self._known[name] = _Known(file, digest, environment.shape, picture)
+        # another's request may have moved it behind the newest, which is returned all the same
+        prepared = self._prepared[digest]
+        while len(self._prepared) > 1 and self.held > self._memory:
             self._prepared.popitem(last=False)
-        return self._prepared[digest]
+        return prepared
 
 
 def _thumbnail(environment: Environment) -> bytes:

@@ -84,15 +84,20 @@ class Need:
     max_pixels: int
 
 
-def need_of(headers: Sequence[exr.Header], bundle: Bundle, total: int) -> Need:
+def need_of(
+    headers: Sequence[exr.Header], bundle: Bundle, total: int, beside: Sequence[Bundle] = ()
+) -> Need:
     """What shading these files takes of `total` bytes, by their headers alone.
 
-    Raises LimitError when the total is too small even for the smallest tiles.
+    With other bundles `beside` it, one after the other, all attributes and answers are held
+    throughout. Raises LimitError when the total is too small even for the smallest tiles.
     """
-    outputs = len(EFFECTS[bundle.effect].outputs)
-    channels = channel_count(bundle.inputs, per_channel=False)
+    bundles = {each.effect: each for each in (bundle, *beside)}
+    outputs = sum(len(EFFECTS[effect].outputs) for effect in bundles)
+    inputs = dict.fromkeys(name for each in bundles.values() for name in each.inputs)
+    channels = channel_count(inputs, per_channel=False)
     height, width = size_of(headers)
-    # Throughout: the files, their channels as float32 with masks, the answer and its copies.
+    # Throughout: the files, their channels as float32 with masks, the answers and their copies.
     pixel = 4 * channels + 4 + 12 * outputs
     held = sum(header.body_bytes for header in headers) + pixel * width * height
     # First strips of all channels as they are stored and what marks the background, then what
@@ -100,7 +105,7 @@ def need_of(headers: Sequence[exr.Header], bundle: Bundle, total: int) -> Need:
     sources = 4 * channels * width * height
     decoded = max(sources, _decoding(headers) + 4 * _MARKERS * width * height)
     # What a tile's pixel takes: within the engine, and as its input and output.
-    tile = bundle.bytes_per_pixel + 4 * (bundle.channels + outputs)
+    tile = bundle.bytes_per_pixel + 4 * (bundle.channels + len(EFFECTS[bundle.effect].outputs))
     least = held + max(decoded, tile * min_tile(height, width, bundle.size_multiple, bundle.halo))
     if least > total:
         raise LimitError("memory_bytes", least, total)

@@ -15,7 +15,7 @@ from deepshade_service.problems import Problem
 
 log = logging.getLogger("deepshade.service")
 
-MAX_ENGINES = 8  # in memory; of others the one that was used longest ago goes
+MAX_ENGINES = 12  # in memory, one for each effect and a few; the one used longest ago goes
 
 Key = tuple[Path, Backend]
 
@@ -179,6 +179,20 @@ def find_effect(name: str) -> Effect:
             effects=sorted(EFFECTS),
         )
     return EFFECTS[name]
+
+
+def find_effects(names: str) -> list[Effect]:
+    """The effects of a list such as "ao,gi"; Problem 404 for an unknown one, 422 for one twice."""
+    effects = [find_effect(name) for name in names.split(",")]
+    for effect in effects:
+        if effects.count(effect) > 1:
+            raise Problem(
+                422,
+                "bad-parameter",
+                f"the effect '{effect.name}' is asked for {effects.count(effect)} times",
+                fix="name each effect once",
+            )
+    return effects
 
 
 def not_ready(models: Models) -> Problem:

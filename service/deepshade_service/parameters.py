@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.fields import FieldInfo
 
-from deepshade.effects import SETTINGS, Effect
+from deepshade.effects import EFFECTS, SETTINGS, Effect
 from deepshade.errors import ConfigError
 from deepshade.exr import COMPRESSIONS
 from deepshade.gbuffer.channels import parse_mapping
@@ -17,9 +18,7 @@ from deepshade_service.problems import Problem
 
 LENS = ("focus", "aperture")  # settings from which the blur circle is derived
 CAMERA = (*LENS, "shutter")
-LIGHT = ("environment", "rotate", "up")  # only effects lit by an environment have them
-
-MAX_TURN = 36000.0
+LIGHT = ("environment", "rotate", "up")
 
 Compression = StrEnum("Compression", {name: name for name in COMPRESSIONS})  # type: ignore[misc]
 Profile = StrEnum("Profile", {name: name for name in PROFILES})  # type: ignore[misc]
@@ -27,12 +26,15 @@ Profile = StrEnum("Profile", {name: name for name in PROFILES})  # type: ignore[
 
 def _setting(name: str, instead: str = "") -> FieldInfo:
     setting = SETTINGS[name]
+    if setting.stored:
+        without = f"what the header's `{setting.header}` says{instead}"
+    else:
+        without = f"{setting.default}"
     return Field(  # type: ignore[no-any-return]
         ge=setting.lowest,
         le=setting.highest,
         allow_inf_nan=False,
-        description=f"{setting.meaning.capitalize()}, in {setting.unit}. Without it, what the"
-        f" header's `{setting.header}` says{instead}.",
+        description=f"{setting.meaning.capitalize()}, in {setting.unit}. Without it, {without}.",
     )
 
 
@@ -51,16 +53,7 @@ class ShadeParameters(BaseModel):
         str | None,
         Field(description="The map that lights the scene (GET /environments); else `sky`."),
     ] = None
-    rotate: Annotated[
-        float | None,
-        Field(
-            ge=-MAX_TURN,
-            le=MAX_TURN,
-            allow_inf_nan=False,
-            description="Degrees by which the map is turned about the world's up axis,"
-            " counter-clockwise as seen from above.",
-        ),
-    ] = None
+    rotate: Annotated[float | None, _setting("rotate")] = None
     up: Annotated[
         Literal["y", "z"] | None,
         Field(description="The world's up axis; else the one of the renderer, else `y`."),
@@ -145,14 +138,24 @@ class ShadeParameters(BaseModel):
         """`map` as attribute -> channel or layer."""
         return parse_mapping(self.map)
 
-    def check(self, effect: Effect) -> None:
-        """Raises Problem 422 for a setting that the effect doesn't have."""
-        for name in ("radius", *CAMERA, *LIGHT):
-            setting = "environment" if name in LIGHT else name
-            if getattr(self, name) is not None and setting not in effect.settings:
-                raise Problem(
-                    422,
-                    "bad-parameter",
-                    f"the effect '{effect.name}' has no setting '{name}'",
-                    fix=f"leave out ?{name}=",
-                )
+    def check(self, effects: Sequence[Effect]) -> None:
+        """Raises Problem 422 for a setting that none of the effects has."""
+        for name, setting in SETTINGS.items():
+            if getattr(self, name) is None or any(effect.takes(setting) for effect in effects):
+                continue
+            asked = " and ".join(f"'{effect.name}'" for effect in effects)
+            having = [effect.name for effect in EFFECTS.values() if effect.takes(setting)]
+            raise Problem(
+                422,
+                "bad-parameter",
+                f"{asked} {'has' if len(effects) == 1 else 'have'} no setting '{name}'",
+                fix=f"leave out ?{name}=; it is a setting of {', '.join(having)}",
+                effects=having,
+            )
+        if self.format == "png" and len(effects) > 1:
+            raise Problem(
+                422,
+                "bad-parameter",
+                "a PNG holds one picture, and several effects were asked for",
+                fix="leave out ?format=png for an EXR of their layers, or ask for one effect",
+            )

@@ -14,7 +14,6 @@ from deepshade import exr
 from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.environments import Environment, Up
 from deepshade.gbuffer import GBuffer
-from deepshade_service.memory import Need
 from deepshade_service.parameters import CAMERA, ShadeParameters
 from deepshade_service.selection import Selection
 from deepshade_service.tiles import Tile
@@ -70,9 +69,12 @@ def explain(
     selection: Selection,
     asked: ShadeParameters,
     plan: ShadePlan,
-    need: Need,
+    memory_bytes: int,
 ) -> Json:
-    """The plan as JSON values: what `?explain=1` answers and an answer's header holds."""
+    """One effect's plan as JSON values: what `?explain=1` answers and an answer's header holds.
+
+    `memory_bytes` are what the whole request holds.
+    """
     bundle, (height, width) = selection.bundle, gbuffer.shape
     return {
         "effect": bundle.effect,
@@ -96,7 +98,7 @@ def explain(
             "in_file": sum(len(header.channels()) for header in headers),
             "decoded": list(dict.fromkeys(name for _, name in gbuffer.decoded)),
         },
-        "memory_bytes": need.total,
+        "memory_bytes": memory_bytes,
     }
 
 

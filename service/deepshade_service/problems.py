@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from http import HTTPStatus
 from typing import Any
 
@@ -12,7 +12,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from deepshade.errors import DeepshadeError, EngineError, LimitError
+from deepshade.errors import DeepshadeError, EngineError, LimitError, nearest
 from deepshade.problems import MEDIA_TYPE, facts_of, kind_of, type_uri
 
 log = logging.getLogger("deepshade.service")
@@ -78,8 +78,8 @@ def respond(problem: Problem) -> JSONResponse:
     )
 
 
-def install(app: FastAPI) -> None:
-    """Make `app` answer every error as a problem document."""
+def install(app: FastAPI, parameters: Collection[str]) -> None:
+    """Make `app`, whose requests may have these parameters, answer errors as problem documents."""
 
     @app.exception_handler(Problem)
     async def _(request: Request, error: Problem) -> JSONResponse:
@@ -112,7 +112,8 @@ def install(app: FastAPI) -> None:
             for entry in error.errors()
         ]
         detail = "; ".join(f"{entry['where']}: {entry['problem']}" for entry in errors)
-        return respond(Problem(422, "bad-parameter", detail, errors=errors))
+        fix = "; ".join(filter(None, (_fix(entry, parameters) for entry in error.errors())))
+        return respond(Problem(422, "bad-parameter", detail, fix=fix, errors=errors))
 
     @app.exception_handler(Exception)
     async def _(request: Request, error: Exception) -> JSONResponse:
@@ -125,3 +126,15 @@ def install(app: FastAPI) -> None:
                 fix="report it with the request that caused it",
             )
         )
+
+
+def _fix(error: Mapping[str, Any], parameters: Collection[str]) -> str:
+    """The parameter that may have been meant, or the nearest value that it may have."""
+    name = str(error["loc"][-1])
+    if error["type"] == "extra_forbidden":
+        close = nearest(name[:100], parameters)
+        return f"did you mean ?{close}=?" if close else "/docs lists the parameters"
+    for bound in ("ge", "le"):
+        if bound in (context := error.get("ctx", {})):
+            return f"the nearest is ?{name}={context[bound]:g}"
+    return ""

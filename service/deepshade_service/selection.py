@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 from deepshade.bundles import Bundle
-from deepshade.effects import EFFECTS
 from deepshade.engines import Backend, available
 from deepshade.errors import EngineError
 from deepshade_service.models import Models
@@ -44,7 +43,6 @@ def allowed(models: Models, effect: str, asked: ShadeParameters) -> list[Candida
             fix="give one of the two",
         )
     bundles = models.find(effect, asked.quality or asked.bundle)
-    asked.check(EFFECTS[effect])
     candidates: list[Candidate] = []
     why = ""
     for bundle in bundles:

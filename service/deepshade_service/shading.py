@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import threading
 from collections.abc import Iterator, Sequence
@@ -12,18 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade import exr, pictures, tensors
+from deepshade import exr, tensors
 from deepshade.bundles import Bundle
-from deepshade.effects import EFFECTS, SETTINGS, Setting
+from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.engines import Engine
 from deepshade.environments import Prepared
-from deepshade.gbuffer import GBuffer, load_gbuffer
+from deepshade.gbuffer import GBuffer
 from deepshade.machine import trim
+from deepshade_service.answers import Made, Place, Shaded, encode, plan_of
+from deepshade_service.decoding import decode, read_headers, stored
 from deepshade_service.environments import DEFAULT, Environments
 from deepshade_service.memory import MemoryBudget, Need, need_of, size_of
 from deepshade_service.models import Models
-from deepshade_service.parameters import LENS, LIGHT, ShadeParameters
-from deepshade_service.plan import Facts, Json, Lighting, ShadePlan, explain, facts_of
+from deepshade_service.parameters import LIGHT, ShadeParameters
+from deepshade_service.plan import Lighting, ShadePlan, explain, facts_of
 from deepshade_service.problems import Problem
 from deepshade_service.selection import Candidate, Selection, select
 from deepshade_service.telemetry import Stopwatch
@@ -38,15 +39,21 @@ _BIG = 512 * 2**20
 
 
 @dataclass(frozen=True, slots=True)
-class Shaded:
-    """An encoded picture, or a plan as JSON, and how it was made."""
+class Job:
+    """One effect of a request: by which bundle on what, and what it is given beside the picture.
 
-    content: bytes
-    media_type: str
-    facts: Facts
-    pixels: int
-    computed: int
-    watch: Stopwatch
+    Without an engine it is only planned.
+    """
+
+    selection: Selection
+    need: Need
+    prepared: Prepared | None
+    engine: Engine | None
+
+    @property
+    def bundle(self) -> Bundle:
+        """The bundle that was selected."""
+        return self.selection.bundle
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,11 +67,11 @@ class Shader:
     environments: Environments
 
     async def shade(
-        self, files: list[Upload], asked: ShadeParameters, candidates: list[Candidate]
+        self, files: list[Upload], asked: ShadeParameters, effects: list[list[Candidate]]
     ) -> Shaded:
-        """The answer, by one of the candidates. Waits, in turn, for a worker and for memory.
+        """The answer, for each effect by one of its candidates, one effect after the other.
 
-        Raises what the steps raise, and Cancelled.
+        Waits, in turn, for a worker and for memory. Raises what the steps raise, and Cancelled.
         """
         watch = Stopwatch()
 
@@ -73,33 +80,47 @@ class Shader:
                 return read_headers(files, asked, self.limits)
 
         def work(cancelled: threading.Event) -> Shaded:
-            if cancelled.is_set():
-                raise Cancelled
-            with watch.time("decode"):
-                gbuffer = decode(files, headers, bundle, asked, self.limits)
-            with watch.time("plan"):
-                plan = plan_shading(gbuffer, bundle, asked, need.max_pixels)
-                if prepared is not None:
-                    plan = lit(plan, prepared, gbuffer, bundle, asked)
-                made = explain(gbuffer, headers, selection, asked, plan, need)
-                facts = facts_of(gbuffer, plan, made)
-            if engine is None:
-                content = json.dumps(made, indent=2).encode()
-                return Shaded(content, "application/json", facts, 0, 0, watch)
-            with watch.time("infer"):
-                shade = infer(gbuffer, plan, engine, cancelled)
+            shades: list[Float] = []
+            made: list[Made] = []
+            bundles = [job.bundle for job in jobs]
+            gbuffers = decode(files, headers, bundles, asked, self.limits)
+            for job in jobs:
+                if cancelled.is_set():
+                    raise Cancelled
+                with watch.time("decode"):
+                    gbuffer = next(gbuffers)
+                place = Place.of(gbuffer)
+                shade, how = run(job, gbuffer, headers, asked, held, cancelled)
+                shades.append(shade)
+                made.append(how)
+                del gbuffer  # the next may be decoded anew
+            if asked.explain:
+                content = json.dumps(plan_of(made), indent=2).encode()
+                return Shaded(content, "application/json", made, watch.milliseconds)
+            gbuffers.close()  # what they share is no longer needed
             with watch.time("encode"):
-                content, media_type = encode(shade, gbuffer, asked, facts, made)
-            return Shaded(content, media_type, facts, shade[0].size, plan.computed, watch)
+                content, media_type = encode(shades, made, place, asked)
+            return Shaded(content, media_type, made, watch.milliseconds)
 
         headers = await self.workers.run(read)
-        selection = await self._select(headers, asked, candidates)
-        bundle = selection.bundle
-        need = need_of(headers, bundle, self.memory.total)
-        prepared = await self._environment(bundle, asked)
-        engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
-        async with self.memory.hold(need.total):
-            return await self.workers.run(_giving_back(engine, need)(work))
+        jobs = await self._jobs(headers, asked, effects)
+        held = max(job.need.total for job in jobs)
+        async with self.memory.hold(held):
+            return await self.workers.run(_giving_back(jobs, held)(work))
+
+    async def _jobs(
+        self, headers: list[exr.Header], asked: ShadeParameters, effects: list[list[Candidate]]
+    ) -> list[Job]:
+        selections = [await self._select(headers, asked, candidates) for candidates in effects]
+        bundles = [selection.bundle for selection in selections]
+        jobs = []
+        for selection in selections:
+            bundle = selection.bundle
+            need = need_of(headers, bundle, self.memory.total, bundles)
+            prepared = await self._environment(bundle, asked)
+            engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
+            jobs.append(Job(selection, need, prepared, engine))
+        return jobs
 
     async def _environment(self, bundle: Bundle, asked: ShadeParameters) -> Prepared | None:
         """The environment that the bundle is to be given, if it takes one.
@@ -109,7 +130,8 @@ class Shader:
         if bundle.environment:
             return await self.environments.get(asked.environment or DEFAULT)
         for name in LIGHT:
-            if getattr(asked, name) is not None:
+            taken = EFFECTS[bundle.effect].takes(SETTINGS[name])
+            if taken and getattr(asked, name) is not None:
                 raise Problem(
                     422,
                     "bad-parameter",
@@ -130,61 +152,33 @@ class Shader:
         return await select(self.models, candidates, asked, megapixels)
 
 
-def read_headers(
-    files: Sequence[Upload], asked: ShadeParameters, limits: exr.Limits
-) -> list[exr.Header]:
-    """The files' checked headers, in which the lens is the one asked for.
-
-    Raises what `exr.read_header` raises.
-    """
-    headers = [exr.read_header(file.data, limits) for file in files]
-    lens = {SETTINGS[name].header: getattr(asked, name) for name in LENS}
-    for part in (part for header in headers for part in header.parts):
-        part.attributes.update({key: value for key, value in lens.items() if value is not None})
-    return headers
-
-
-def decode(
-    files: Sequence[Upload],
+def run(
+    job: Job,
+    gbuffer: GBuffer,
     headers: Sequence[exr.Header],
-    bundle: Bundle,
     asked: ShadeParameters,
-    limits: exr.Limits,
-) -> GBuffer:
-    """The G-buffer that the bundle's network needs, found or derived in the files.
+    held: int,
+    cancelled: threading.Event,
+) -> tuple[Float, Made]:
+    """One effect's answer and how it was made; an empty one without an engine.
 
-    Nothing else is decoded. A blur circle that the files hold is of their lens: where another is
-    asked for, it is derived. Raises what `load_gbuffer` raises, and Problem 422 for a shutter
-    asked for where the header doesn't say which one the motion holds for.
+    `held` is the memory that the request holds. Raises what the steps raise.
     """
-    needs = list(bundle.inputs)
-    new_lens = any(getattr(asked, name) is not None for name in LENS)
-    if EFFECTS[bundle.effect].background == "light" and "light" not in needs:
-        needs.append("light")
-    gbuffer = load_gbuffer(
-        [(file.name, file.data) for file in files],
-        needs,
-        profile=asked.profile,
-        mapping=asked.mapping,
-        fov=asked.fov,
-        limits=limits,
-        headers=headers,
-        anew=("focal",) if new_lens and "focal" in needs else (),
-    )
-    if asked.shutter is not None:
-        setting = SETTINGS["shutter"]
-        shutter = _stored(gbuffer, setting)
-        if not shutter:
-            raise Problem(
-                422,
-                "bad-parameter",
-                "shutter: motion can't be scaled, for the header doesn't say how long the shutter"
-                " is open that it holds for",
-                fix=f"write {setting.header}, in {setting.unit} above 0, or leave out ?shutter=",
-            )
-        gbuffer.attributes["motion"] *= np.float32(asked.shutter / shutter)
-        gbuffer.header[setting.header] = asked.shutter
-    return gbuffer
+    watch, bundle = Stopwatch(), job.bundle
+    with watch.time("plan"):
+        plan = plan_shading(gbuffer, bundle, asked, job.need.max_pixels)
+        if job.prepared is not None:
+            plan = lit(plan, job.prepared, gbuffer, bundle, asked)
+        made = explain(gbuffer, headers, job.selection, asked, plan, held)
+        facts = facts_of(gbuffer, plan, made)
+    shade = np.empty((0, 0, 0), np.float32)
+    if job.engine is not None:
+        with watch.time("infer"):
+            shade = infer(gbuffer, plan, job.engine, cancelled)
+        if held > _BIG:
+            job.engine.shrink()  # for the next one
+    pixels = gbuffer.background.size
+    return shade, Made(bundle.effect, facts, made, pixels, plan.computed, watch.milliseconds)
 
 
 def plan_shading(
@@ -250,66 +244,24 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
     return shade
 
 
-def encode(
-    shade: Float, gbuffer: GBuffer, asked: ShadeParameters, facts: Facts, made: Json
-) -> tuple[bytes, str]:
-    """The answer's bytes and media type; it lies where the G-buffer lay.
-
-    Its header holds `facts` and, as JSON, the plan (`made`).
-    """
-    effect = EFFECTS[str(facts["effect"])]
-    if asked.format == "png":
-        return pictures.png(pictures.of_effect(shade, effect)), "image/png"
-    attributes = gbuffer.placement()
-    attributes |= {f"deepshade:{name}": value for name, value in facts.items()}
-    attributes["deepshade:plan"] = json.dumps(made, separators=(",", ":"))
-    stream = io.BytesIO()
-    exr.write(
-        stream,
-        dict(zip(effect.outputs, shade, strict=True)),
-        attributes=attributes,
-        compression=asked.compression,
-        half=asked.half,
-        data_window=gbuffer.data_window,
-        display_window=gbuffer.display_window,
-    )
-    return stream.getvalue(), "image/x-exr"
-
-
 @contextmanager
-def _giving_back(engine: Engine | None, need: Need) -> Iterator[None]:
+def _giving_back(jobs: Sequence[Job], held: int) -> Iterator[None]:
     """Memory that the block leaves behind is given back if it was much."""
     try:
         yield
     finally:
-        if engine is not None and need.total > _BIG:
-            engine.shrink()
+        engines = [job.engine for job in jobs if job.engine is not None]
+        if engines and held > _BIG:
+            for engine in engines:
+                engine.shrink()
             trim()
 
 
 def _radius(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> tuple[float, str]:
+    setting = SETTINGS["radius"]
+    if not EFFECTS[bundle.effect].takes(setting):
+        return bundle.radius, "bundle"
     if asked.radius is not None:
         return asked.radius, "request"
-    if "radius" not in EFFECTS[bundle.effect].settings:
-        return bundle.radius, "bundle"
-    radius = _stored(gbuffer, SETTINGS["radius"], "; ?radius= overrides it")
+    radius = stored(gbuffer, setting, "; ?radius= overrides it")
     return (bundle.radius, "bundle") if radius is None else (radius, "header")
-
-
-def _stored(gbuffer: GBuffer, setting: Setting, instead: str = "") -> float | None:
-    """What the header says of a setting. Raises Problem 422 where it can't mean that."""
-    stored = gbuffer.header.get(setting.header)
-    if stored is None:
-        return None
-    try:
-        value = float(stored)
-    except (TypeError, ValueError):
-        value = float("nan")
-    if not setting.lowest <= value <= setting.highest:
-        raise Problem(
-            422,
-            "bad-header",
-            f"the image's header says {setting.header} = {str(stored)[:60]}",
-            fix=f"it must be a number from {setting.lowest:g} to {setting.highest:g}{instead}",
-        )
-    return value

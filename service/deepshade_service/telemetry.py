@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
@@ -30,9 +30,10 @@ class Stopwatch:
             took = 1e3 * (time.perf_counter() - start)
             self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + took
 
-    def server_timing(self) -> str:
-        """As the value of a Server-Timing header."""
-        return ", ".join(f"{name};dur={ms:.2f}" for name, ms in self.milliseconds.items())
+
+def server_timing(milliseconds: Mapping[str, float]) -> str:
+    """Times of stages as the value of a Server-Timing header."""
+    return ", ".join(f"{name};dur={ms:.2f}" for name, ms in milliseconds.items())
 
 
 class Telemetry:
@@ -73,10 +74,15 @@ class Telemetry:
         self._requests.labels(route, str(status)).inc()
 
     def shaded(
-        self, effect: str, watch: Stopwatch, pixels: int, computed: int, nonfinite: int
+        self,
+        effect: str,
+        milliseconds: Mapping[str, float],
+        pixels: int,
+        computed: int,
+        nonfinite: int,
     ) -> None:
-        """Count a shaded picture."""
-        for stage, ms in watch.milliseconds.items():
+        """Count an effect of a picture; `milliseconds` are by stage."""
+        for stage, ms in milliseconds.items():
             self._stages.labels(effect, stage).observe(ms / 1e3)
         self._pixels.labels(effect).inc(pixels)
         self._computed.labels(effect).inc(computed)

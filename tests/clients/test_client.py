@@ -182,6 +182,53 @@ def test_problems_become_exceptions(server, make_exr, make_picture):
             client.shade("ao", make_exr(4, 4), Options(radius=-1))
 
 
+def test_several_effects_in_one_request(make_exr):
+    """As a string or a list; arrays and facts are by effect, and both clients send the same."""
+    rng = np.random.default_rng(3)
+    names = ("ao.Y", "gi.R", "gi.G", "gi.B")
+    channels = {name: rng.random((4, 6), np.float32) for name in names}
+    transport = MockTransport(
+        lambda request: mock_answer(
+            channels, ao={"bundle": "best", "derived": "a: b; c"}, gi={"bundle": "fast"}
+        )
+    )
+    with Client(transport=transport) as client:
+        answers = [client.shade(each, make_exr(4, 6)) for each in ("ao,gi", ["ao", "gi"])]
+
+    async def work():
+        async with AsyncClient(transport=transport) as client:
+            return await client.shade(("ao", "gi"), make_exr(4, 6))
+
+    answers.append(asyncio.run(work()))
+    assert {request.url.raw_path for request in transport.requests} == {b"/shade/ao,gi"}
+    for answer in answers:
+        assert answer.effects == ["ao", "gi"]
+        assert answer.facts["ao.bundle"] == "best"
+        assert answer.facts["gi.bundle"] == "fast"
+        arrays = answer.arrays()
+        assert list(arrays) == ["ao", "gi"]
+        np.testing.assert_array_equal(arrays["ao"], channels["ao.Y"][None])
+        np.testing.assert_array_equal(arrays["gi"], [channels[f"gi.{band}"] for band in "RGB"])
+
+
+def test_one_effect_gives_its_array_too(server, make_exr):
+    with Client(server) as client:
+        answer = client.shade(["ao"], make_exr(4, 6))
+    assert answer.effects == ["ao"]
+    np.testing.assert_array_equal(answer.arrays()["ao"], [answer.channels()["Y"]])
+
+
+@pytest.mark.parametrize("header", ["", "[1]", "{"])
+def test_facts_that_cannot_be_read_are_a_bad_answer(header):
+    def handler(request):
+        response = mock_answer({"ao.Y": np.ones((2, 2))}, effects="ao,gi", ao={"radius": 2})
+        response.headers["Deepshade-Gi"] = header
+        return response
+
+    with Client(transport=MockTransport(handler)) as client, pytest.raises(BadAnswer, match="gi"):
+        client.shade("ao,gi", b"")
+
+
 def test_effects(server):
     with Client(server) as client:
         assert client.wait_until_ready()["status"] == "ready"

@@ -190,6 +190,11 @@ def test_one_bad_picture_does_not_stop_the_others(run, views, tmp_path):
 def test_map_and_problems_with_their_fix(run, views, tmp_path):
     _, err = run("shade", "aoo", views / "a.exr", "-o", tmp_path / "x.exr", code=1)
     assert "did you mean 'ao'?" in err
+    _, err = run("shade", "ao", views / "a.exr", "-o", tmp_path / "x.exr", "--focus", 3, code=1)
+    assert "'ao' has no setting 'focus'" in err
+    assert "dof, full" in err
+    _, err = run("shade", "ao", views / "a.exr", "-o", "x.exr", "--raduis", "3", code=2)
+    assert "--radius" in err
     _, err = run("shade", "ao", views / "a.exr", "-o", "x.exr", "--map", "normal", code=2)
     assert "attribute=channel" in err
     _, err = run("shade", "ao", views / "a.exr", "-o", views / "a.exr", code=2)
@@ -211,6 +216,8 @@ def test_effects_and_models(run):
     out, _ = run("effects")
     assert "Ambient occlusion" in out
     assert "tiny" in out
+    for said in ("--radius", "scene units", "deepshade:radius, else 0.5", "--environment"):
+        assert said in " ".join(out.split())
     out, _ = run("models", "--json")
     (model,) = json.loads(out)
     assert (model["effect"], model["name"]) == ("ao", "tiny")

@@ -18,7 +18,7 @@ from deepshade.errors import (
     MissingAttributeError,
 )
 from deepshade.exr import Limits
-from deepshade.gbuffer import load_gbuffer
+from deepshade.gbuffer import load_gbuffer, load_gbuffers
 
 NEEDS = ("normal", "position")
 W, H = 48, 32
@@ -482,3 +482,59 @@ def test_scale_changes_nothing_but_the_scale(factor):
         scaled.attributes["position"], base.attributes["position"] * factor, rtol=1e-5
     )
     np.testing.assert_allclose(scaled.attributes["normal"], base.attributes["normal"], atol=1e-3)
+
+
+WANTED = (("normal", "position"), ("focal",), ("light",), ("normal_world", "view"), ("depth",))
+LIGHT = layer("light", np.full((3, H, W), 2, "f"), "RGB")
+
+
+def broken(channels, name, value):
+    """The channels, and in one of them a value amidst the floor."""
+    plane = channels[name].copy()
+    plane[20, 10] = value
+    return channels | {name: plane}
+
+
+FAR = layer("position_world", P_WORLD) | {"Z": Z}
+
+
+@pytest.mark.parametrize(
+    ("channels", "shared"),
+    [
+        ({"Z": Z}, True),
+        (layer("position", P) | {"Z": Z}, True),
+        (layer("position", P) | layer("normal", N), False),  # nothing marks the light's background
+        (broken(layer("normal", N) | {"Z": Z}, "normal.Y", np.nan), False),
+        (broken({"Z": Z}, "Z", np.nan), True),
+        (broken(broken(FAR, "position_world.X", 3e38), "position_world.Z", -3e38), False),
+    ],
+    ids=["derived", "stored", "no depth", "NaN in one", "NaN in all", "overflows in one"],
+)
+def test_several_are_each_what_it_is_alone(channels, shared):
+    """Bit for bit; and they share memory where they can."""
+    header = HEADER | {"deepshade:focus": 4.0, "deepshade:aperture": 0.1}
+    body = encode(channels | LIGHT, header, half=False)
+    several = list(load_gbuffers(body, WANTED))
+    for found, needs in zip(several, WANTED, strict=True):
+        alone = load_gbuffer(body, needs)
+        assert list(found.attributes) == list(needs)
+        for name, array in alone.attributes.items():
+            np.testing.assert_array_equal(found.attributes[name], array)
+        np.testing.assert_array_equal(found.background, alone.background)
+        for fact in ("nonfinite", "mapped", "decoded", "derived", "camera", "data_window"):
+            assert getattr(found, fact) == getattr(alone, fact), fact
+    assert (len({id(each.background) for each in several}) == 1) == shared
+
+
+def test_several_must_cover_the_same_pixels():
+    small = {f"light.{c}": np.ones((4, 4), "f") for c in "RGB"}
+    bodies = [encode({"Z": Z}), encode(small, data_window=(0, 0, 3, 3))]
+    assert load_gbuffer(bodies, ("depth",)).shape == (H, W)
+    with pytest.raises(ImageError, match="different pixels"):
+        list(load_gbuffers(bodies, [("depth",), ("light",)]))
+
+
+def test_all_that_several_lack_is_said_at_once():
+    with pytest.raises(MissingAttributeError) as caught:
+        list(load_gbuffers(encode({"Z": Z}), [("depth",), ("light",), ("motion", "scatter")]))
+    assert caught.value.missing == ("light", "motion", "scatter")

@@ -141,6 +141,35 @@ def test_a_map_is_added_and_replaced(lit, maps):
 
 
 @pytest.mark.slow
+def test_a_map_that_changes_on_disk_is_read_anew(lit, maps):
+    """Also in place, with the same size; and a map that stays isn't."""
+    environments = lit.service.environments
+    before = pixels(shade(lit, environment="noon", half="false"))
+    kept = lit.run(environments.get("noon"))
+    pixels(shade(lit, environment="noon"))
+    assert lit.run(environments.get("noon")) is kept
+    seen = lit.client.get("/environments/noon/thumbnail").content
+    brighter = sky(elevation=80, height=32).radiance * 2
+    (maps / "noon.exr").write_bytes(as_exr(Environment("", brighter)))
+    assert lit.client.get("/environments/noon/thumbnail").content == seen  # exposed by the median
+    response = shade(lit, environment="noon", half="false")
+    np.testing.assert_allclose(pixels(response), 2 * before, rtol=1e-4, atol=1e-5)
+    (maps / "noon.exr").unlink()
+    assert shade(lit, environment="noon").status_code == 422
+
+
+@pytest.mark.slow
+def test_prepared_maps_are_bounded_in_bytes(start, lookups, maps):
+    """A quarter of the memory, which here holds one map and not two; the latest stays."""
+    local = start(models=lookups, environments=maps, memory=2**29)
+    environments = local.service.environments
+    for name in ("noon", "evening", "evening"):
+        shade(local, environment=name)
+        assert 0 < environments.held <= 2**27
+    assert list(environments._prepared) == [read_environment(maps / "evening.exr").sha256]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("query", "said", "fix"),
     [

@@ -163,3 +163,31 @@ def test_what_a_derivation_takes_is_counted(service, make_exr, make_picture):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak <= needed - len(body)
+
+
+def test_what_several_effects_decode_is_counted(service, make_exr, make_picture):
+    """Together, and one by one where a NaN parts them: what was decoded before is gone by then."""
+    import tracemalloc
+
+    from deepshade.effects import EFFECTS
+    from deepshade.gbuffer import load_gbuffers
+
+    tiny = replace(service.engine().bundle, bytes_per_pixel=1)
+    rows = [EFFECTS[name] for name in ("ao", "sss")]
+    bundles = [replace(tiny, effect=row.name, inputs=row.inputs) for row in rows]
+    rng = np.random.default_rng(0)
+    channels = make_picture(512, 512)
+    for layer in ("light", "scatter"):
+        channels |= {f"{layer}.{c}": rng.random((512, 512), np.float32) for c in "RGB"}
+    for nan in (False, True):
+        channels["light.R"][0, 0] = np.nan if nan else 1
+        body = make_exr(channels, half=True, compression="none")
+        header = exr.read_header(body)
+        needed = max(need_of([header], bundle, 2**30, bundles).total for bundle in bundles)
+        tracemalloc.start()
+        for gbuffer in load_gbuffers(body, [row.inputs for row in rows], headers=[header]):
+            assert gbuffer.nonfinite == (nan and "light" in gbuffer.attributes)
+            del gbuffer
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak <= needed - len(body)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import signal
 import subprocess
@@ -32,7 +33,37 @@ def test_effects(client):
     assert bundle["metrics"] == {"error": {"test-real": {"exact": {"dssim": 0.25}}}}
     assert bundle["dssim"] == 0.25
     assert bundle["radius"] == 0.5
-    assert ao["settings"] == ["radius"]
+    assert bundle["times"] == []
+    (radius,) = ao["settings"]
+    assert (radius["name"], radius["unit"]) == ("radius", "scene units")
+    assert (radius["header"], radius["default"]) == ("deepshade:radius", 0.5)  # the bundle's own
+    by_name = {effect["name"]: effect for effect in effects}
+    settings = {setting["name"]: setting for setting in by_name["full"]["settings"]}
+    assert list(settings) == ["radius", "focus", "aperture", "environment", "rotate", "up"]
+    assert (settings["aperture"]["lowest"], settings["aperture"]["default"]) == (0, None)
+    assert (settings["environment"]["header"], settings["environment"]["default"]) == (None, "sky")
+
+
+def test_a_setting_s_range_is_the_parameter_s(client):
+    """What GET /effects says is what a request may say."""
+    parameters = client.get("/openapi.json").json()["paths"]["/shade/{effect}"]["post"][
+        "parameters"
+    ]
+    schemas = {parameter["name"]: parameter["schema"] for parameter in parameters}
+    for effect in client.get("/effects").json():
+        for setting in effect["settings"]:
+            kinds = schemas[setting["name"]].get("anyOf", [schemas[setting["name"]]])
+            assert setting["lowest"] == kinds[0].get("minimum")
+            assert setting["highest"] == kinds[0].get("maximum")
+
+
+def test_published_times_are_those_of_the_backend(start, tmp_path, make_bundle):
+    make_bundle(tmp_path / "ao" / "timed")
+    path = tmp_path / "ao" / "timed" / "metrics.json"
+    both = {"onnxruntime/fp32": 12.5, "openvino/bf16": 3.0}
+    path.write_text(json.dumps({"speed": {"a CPU": {"size": [768, 512], "ms": both}}}))
+    (bundle,) = start(models=tmp_path).client.get("/effects/ao").json()["bundles"]
+    assert bundle["times"] == [{"machine": "a CPU", "size": [768, 512], "ms": 12.5}]
     assert (bundle["engine"], bundle["precision"]) == ("onnxruntime", "fp32")
 
 

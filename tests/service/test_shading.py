@@ -16,7 +16,7 @@ from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade.gbuffer import GBuffer
 from deepshade.tensors import tensor
-from deepshade_service import shading
+from deepshade_service import decoding, shading
 from deepshade_service.parameters import ShadeParameters
 
 EXR = {"Content-Type": "image/x-exr"}
@@ -198,8 +198,8 @@ def test_the_lens_that_is_asked_for_overrides_the_header(make_exr):
     found = []
     for query in ({}, {"focus": 2.0, "aperture": 0.5}):
         asked, limits = ShadeParameters(**query), exr.Limits()
-        headers = shading.read_headers(files, asked, limits)
-        gbuffer = shading.decode(files, headers, bundle("dof"), asked, limits)
+        headers = decoding.read_headers(files, asked, limits)
+        (gbuffer,) = decoding.decode(files, headers, [bundle("dof")], asked, limits)
         found.append(float(gbuffer.attributes["focal"][0, 0, 0]))
     pixels_per_unit = 4.0  # 8 pixels across 2 units, at distance 1
     np.testing.assert_allclose(found[0], 9 * pixels_per_unit * (1 / 1 - 1 / 4), rtol=1e-5)

@@ -98,7 +98,8 @@ class View:
 
     def settings(self) -> dict[str, float | str]:
         """The settings that are set, by their names in `deepshade.effects.SETTINGS`."""
-        return {name: value for name in SETTINGS if (value := getattr(self, name)) is not None}
+        names = (name for name, setting in SETTINGS.items() if not setting.of)
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def header(self) -> dict[str, Any]:
         """The EXR attributes of the camera and the settings."""

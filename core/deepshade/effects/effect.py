@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from deepshade.attributes import ATTRIBUTES
+from deepshade.effects.settings import Setting
 from deepshade.symmetry import ALL
 
 RGB = ("R", "G", "B")
@@ -58,6 +59,10 @@ class Effect:
         for name in self.inputs:
             if name not in ATTRIBUTES:
                 raise ValueError(f"{self.name}: no attribute is called '{name}'")
+
+    def takes(self, setting: Setting) -> bool:
+        """Whether a user sets it of this effect: `settings` name it, or what it belongs to."""
+        return (setting.of or setting.name) in self.settings
 
     @property
     def is_light(self) -> bool:

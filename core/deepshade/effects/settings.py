@@ -6,20 +6,26 @@ from dataclasses import dataclass
 
 # Far beyond any scene, and safely inside what float32 can divide by.
 MIN_LENGTH, MAX_LENGTH = 1e-30, 1e30
+MAX_TURN = 36000.0
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One setting: its unit, the lowest and highest value, and what it means.
+    """One setting: its unit, what it means, the lowest and highest value, and the default.
 
-    An image's header holds it as `deepshade:<name>`.
+    A name has neither lowest nor highest. Where `stored`, an image's header holds it as
+    `deepshade:<name>`, which comes before the default; None is none, or one of the bundle.
+    An effect that has the setting `of` has this one too.
     """
 
     name: str
     unit: str
-    lowest: float
-    highest: float
     meaning: str
+    lowest: float | None = None
+    highest: float | None = None
+    default: float | str | None = None
+    stored: bool = True
+    of: str = ""
 
     @property
     def header(self) -> str:
@@ -28,11 +34,35 @@ class Setting:
 
 
 _TABLE = (
-    Setting("radius", "scene units", MIN_LENGTH, MAX_LENGTH, "how far the effect reaches"),
-    Setting("focus", "scene units", MIN_LENGTH, MAX_LENGTH, "distance of the plane in focus"),
-    Setting("aperture", "scene units", 0.0, MAX_LENGTH, "diameter of the lens"),
-    Setting("shutter", "frames", 0.0, 1.0, "how long the shutter is open"),
-    Setting("environment", "name", 0.0, 0.0, "the environment map that lights the scene"),
+    Setting("radius", "scene units", "how far the effect reaches", MIN_LENGTH, MAX_LENGTH),
+    Setting("focus", "scene units", "distance of the plane in focus", MIN_LENGTH, MAX_LENGTH),
+    Setting("aperture", "scene units", "diameter of the lens", 0.0, MAX_LENGTH),
+    Setting("shutter", "frames", "how long the shutter is open", 0.0, 1.0),
+    Setting(
+        "environment",
+        "name",
+        "the environment map that lights the scene",
+        default="sky",
+        stored=False,
+    ),
+    Setting(
+        "rotate",
+        "degrees",
+        "how far the map is turned about the world's up axis, counter-clockwise from above",
+        -MAX_TURN,
+        MAX_TURN,
+        default=0.0,
+        stored=False,
+        of="environment",
+    ),
+    Setting(
+        "up",
+        "y or z",
+        "the world's up axis, if it isn't the renderer's",
+        default="y",
+        stored=False,
+        of="environment",
+    ),
 )
 
 SETTINGS: dict[str, Setting] = {setting.name: setting for setting in _TABLE}

@@ -30,22 +30,35 @@ def remove(arrays: Mapping[str, Array], suspects: Collection[str]) -> tuple[Mask
     """
     background = np.zeros(next(iter(arrays.values())).shape[1:], np.bool_)
     count = 0
-    # those first of which one channel tells
-    asked = sorted(_EMPTY.keys() & arrays.keys(), key=list(_EMPTY).index)
     stays = {name for name in arrays if in_background(name)}
     for rows in _blocks(background.shape):
         block = {name: array[:, rows] for name, array in arrays.items()}
         empty = background[rows]
-        for name in asked:
-            _EMPTY[name](block[name], empty)
-            if empty.all():
-                break
-        if suspects:
-            count += _broken({name: block[name] for name in suspects}, empty)
+        count += _mark(block, suspects, empty)
         _clear([array for name, array in block.items() if name not in stays], empty)
         for name in stays.intersection(suspects):
             _clear([block[name]], nonfinite(block[name]))
     return background, count
+
+
+@np.errstate(invalid="ignore")
+def same(
+    arrays: Mapping[str, Array], suspects: Collection[str], users: Iterable[Collection[str]]
+) -> bool:
+    """Whether `remove` would find the same for all `users`, who each look at some quantities."""
+    asked = {frozenset(_EMPTY.keys() & set(user)) for user in users}
+    if len({frozenset(suspects) & set(user) for user in users}) > 1:
+        return False
+    for rows in _blocks(next(iter(arrays.values())).shape[1:]):
+        first: Mask | None = None
+        for names in asked:
+            block = {name: arrays[name][:, rows] for name in names}
+            empty = np.zeros(next(iter(arrays.values()))[0, rows].shape, np.bool_)
+            _mark(block, names.intersection(suspects), empty)
+            if first is not None and (empty != first).any():
+                return False
+            first = empty
+    return True
 
 
 def in_background(quantity: str) -> bool:
@@ -78,6 +91,16 @@ def _clear(arrays: Iterable[Array], background: Mask) -> None:
             np.bitwise_and(bits, keep, out=bits)
         elif bits.view(np.uint32).max():  # mostly all are 0 already
             bits[...] = 0
+
+
+def _mark(block: Mapping[str, Array], suspects: Collection[str], empty: Mask) -> int:
+    """Marks in `empty` where nothing is shown; the number that held NaN or infinities."""
+    # those first of which one channel tells
+    for name in sorted(_EMPTY.keys() & block.keys(), key=list(_EMPTY).index):
+        _EMPTY[name](block[name], empty)
+        if empty.all():
+            break
+    return _broken({name: block[name] for name in suspects}, empty) if suspects else 0
 
 
 def _broken(arrays: Mapping[str, Array], empty: Mask) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera, placement_of
-from deepshade.errors import CameraError, ConfigError, ImageError
+from deepshade.errors import CameraError, ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
 from deepshade.gbuffer import background, channels, derivation
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
@@ -64,9 +64,25 @@ class GBuffer:
         return placement_of(self.part_header) | (self.camera.to_header() if self.camera else {})
 
 
-def load_gbuffer(
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """What one G-buffer needs, where in the files that is, and the steps that derive the rest."""
+
+    needs: Sequence[str]
+    plan: Plan
+    choices: dict[str, channels.Choice]
+    steps: dict[str, derivation.Derivation]
+    part: exr.Part
+
+
+def load_gbuffer(sources: Source | Sequence[Source], needs: Sequence[str], **how: Any) -> GBuffer:
+    """Loads the attributes `needs` of one view; `how` and what it raises are `load_gbuffers`'."""
+    return next(load_gbuffers(sources, [needs], **how))
+
+
+def load_gbuffers(
     sources: Source | Sequence[Source],
-    needs: Sequence[str],
+    needs: Sequence[Sequence[str]],
     *,
     profile: str | None = None,
     mapping: Mapping[str, str] | None = None,
@@ -74,8 +90,8 @@ def load_gbuffer(
     limits: Limits | None = None,
     headers: Sequence[Header] | None = None,
     anew: Collection[str] = (),
-) -> GBuffer:
-    """Loads the attributes `needs` from one EXR file, or from several of one view.
+) -> Generator[GBuffer]:
+    """Loads one EXR file, or several of one view, for each of `needs`: names of attributes.
 
     A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
     (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
@@ -83,11 +99,16 @@ def load_gbuffer(
     What isn't there, or is to be `anew`, is derived (`derivation`): `GBuffer.derived` says how.
     `headers` are what `exr.read_header` gave for the same sources, to spare reading them again.
 
+    Each G-buffer is what it would be alone. They share arrays, and so what is decoded and derived
+    for them, as long as their backgrounds are the same; where one reads a NaN that another
+    doesn't, each is decoded when it is asked for.
+
     Raises ImageError, DamagedImageError, LimitError, MissingAttributeError,
     AmbiguousChannelError, CameraError, ConfigError.
     """
     limits = limits or Limits()
-    for name in needs:
+    every = list(dict.fromkeys(name for each in needs for name in each))
+    for name in every:
         if name not in ATTRIBUTES:
             raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called '{name}'")
     stems, bodies = _fetch(sources, limits)
@@ -95,40 +116,106 @@ def load_gbuffer(
     limits.check("parts", sum(len(header.parts) for header in headers))
     limits.check("channels", sum(len(p.channels) for header in headers for p in header.parts))
     limits.check("decoded_bytes", sum(header.decoded_bytes for header in headers))
-    planned = plan_gbuffer(headers, stems, needs, profile=profile, mapping=mapping, fov=fov)
-    for name in anew:
-        planned.choices.pop(name, None)
-    planned.require(needs)
+
+    def plan(wanted: Sequence[str]) -> Plan:
+        found = plan_gbuffer(headers, stems, wanted, profile=profile, mapping=mapping, fov=fov)
+        for name in anew:
+            found.choices.pop(name, None)
+        found.require(wanted)
+        return found
+
+    try:
+        jobs = [_job(each, plan(each), mapping or {}) for each in needs]
+    except MissingAttributeError:
+        if len(needs) > 1:
+            plan(every)  # which says all that is missing
+        raise
+    if len({job.part.data_window for job in jobs}) > 1:
+        raise ImageError("the attributes cover different pixels", fix="render them as one view")
+    yield from _load(jobs, bodies, headers, limits)
+
+
+def _job(needs: Sequence[str], plan: Plan, mapping: Collection[str]) -> _Job:
     steps: dict[str, derivation.Derivation] = {}
     for name in needs:
-        for step in derivation.plan(name, {*planned.choices, *steps}, planned.met) or ():
+        for step in derivation.plan(name, {*plan.choices, *steps}, plan.met) or ():
             steps.setdefault(step.target, step)
-
     used = {*needs, *(need for step in steps.values() for need in step.needs)}
-    choices = chosen(planned, used, mapping or {})
-    part = planned.parts(next(iter(choices.values())))[0]
-    if planned.camera:
-        planned.camera = framed(planned.camera, part)
+    choices = chosen(plan, used, mapping)
+    part = plan.parts(next(iter(choices.values())))[0]
+    if plan.camera:
+        plan.camera = framed(plan.camera, part)
+    return _Job(needs, plan, choices, steps, part)
+
+
+def _load(
+    jobs: Sequence[_Job], bodies: Sequence[bytes], headers: Sequence[Header], limits: Limits
+) -> Generator[GBuffer]:
+    """The jobs' G-buffers: together if they are then what they are alone, else one by one."""
+    loaded = _together(jobs, bodies, headers, limits) if _agree(jobs) else None
+    if loaded is None:
+        for job in jobs:
+            yield from _load([job], bodies, headers, limits)
+        return
+    arrays, empty, nonfinite = loaded
+    for job in jobs:
+        yield GBuffer(
+            attributes={name: arrays[name] for name in job.needs},
+            background=empty,
+            camera=job.plan.camera,
+            nonfinite=nonfinite,
+            mapped={name: str(choice) for name, choice in job.choices.items()},
+            decoded=tuple((c.file, name) for c in job.choices.values() for name in c.channels),
+            derived={name: job.plan.how(step) for name, step in job.steps.items()},
+            header=job.plan.attributes,
+            part_header=job.part.attributes,
+            data_window=job.part.data_window,
+            display_window=job.part.display_window,
+            up=job.plan.profile.up if job.plan.profile else "y",
+        )
+
+
+def _agree(jobs: Sequence[_Job]) -> bool:
+    """Whether all mean the same by every quantity, and see it through the same camera."""
+    choices: dict[str, channels.Choice] = {}
+    for job in jobs:
+        choices = {**job.choices, **choices}
+    first = jobs[0].plan
+    for job in jobs:
+        if (
+            any(choices[name] != choice for name, choice in job.choices.items())
+            or not choices.keys().isdisjoint(job.steps)
+            or first.camera != job.plan.camera
+            or not np.array_equal(_matrix(first), _matrix(job.plan))
+        ):
+            return False
+    return True
+
+
+def _matrix(plan: Plan) -> NDArray[np.float64]:
+    return np.empty(0) if plan.matrix is None else plan.matrix
+
+
+def _together(
+    jobs: Sequence[_Job], bodies: Sequence[bytes], headers: Sequence[Header], limits: Limits
+) -> tuple[dict[str, NDArray[np.float32]], NDArray[np.bool_], int] | None:
+    """(the attributes of all jobs, the background, how many pixels held NaN or infinities).
+
+    None where a job's background or count would be another's.
+    """
+    choices = {name: choice for job in jobs for name, choice in job.choices.items()}
     arrays, suspects = _read(bodies, headers, choices, limits)
+    if len(jobs) > 1 and not background.same(arrays, suspects, [job.choices for job in jobs]):
+        return None
     empty, nonfinite = background.remove(arrays, suspects)
+    steps = {name: step for job in jobs for name, step in job.steps.items()}
     if steps:
-        empty, more = _derive(steps.values(), planned, arrays, empty)
+        empty, more = _derive(steps.values(), jobs[0].plan, arrays, empty)
+        if more and len(jobs) > 1:
+            return None
         nonfinite += more
     _check_side(arrays, empty)
-    return GBuffer(
-        attributes={name: arrays[name] for name in needs},
-        background=empty,
-        camera=planned.camera,
-        nonfinite=nonfinite,
-        mapped={name: str(choice) for name, choice in choices.items()},
-        decoded=tuple((c.file, name) for c in choices.values() for name in c.channels),
-        derived={name: planned.how(step) for name, step in steps.items()},
-        header=planned.attributes,
-        part_header=part.attributes,
-        data_window=part.data_window,
-        display_window=part.display_window,
-        up=planned.profile.up if planned.profile else "y",
-    )
+    return {name: arrays[name] for job in jobs for name in job.needs}, empty, nonfinite
 
 
 def source_name(field: str, filename: str) -> str:

@@ -1,0 +1,115 @@
+"""What a request is answered with: one picture of one or several effects, and how it was made."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deepshade import exr, pictures
+from deepshade.effects import EFFECTS
+from deepshade.gbuffer import GBuffer
+from deepshade_service.parameters import ShadeParameters
+from deepshade_service.plan import Facts, Json
+
+Float = NDArray[np.float32]
+
+_STAGES = ("decode", "plan", "infer", "encode")
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """How one effect was made: as facts and as a plan, of how many pixels, in what time."""
+
+    effect: str
+    facts: Facts
+    plan: Json
+    pixels: int
+    computed: int
+    milliseconds: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Shaded:
+    """An encoded picture, or plans as JSON; how each effect was made, and what all share."""
+
+    content: bytes
+    media_type: str
+    made: Sequence[Made]
+    milliseconds: Mapping[str, float]
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """Those of its effect, or of each, by its name."""
+        if len(self.made) == 1:
+            return self.made[0].facts
+        names = ",".join(each.effect for each in self.made)
+        return {"effects": names} | {each.effect: each.facts for each in self.made}
+
+    @property
+    def stages(self) -> dict[str, float]:
+        """Milliseconds by stage, and what each of several effects took of it."""
+        stages = {**dict.fromkeys(_STAGES, 0.0), **self.milliseconds}
+        single: dict[str, float] = {}
+        for each in self.made:
+            for stage, ms in each.milliseconds.items():
+                stages[stage] += ms
+                single[f"{stage}-{each.effect}"] = ms
+        stages = {name: ms for name, ms in stages.items() if ms}
+        return stages if len(self.made) == 1 else stages | single
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where an answer lies: EXR attributes of the camera, and the windows."""
+
+    attributes: Mapping[str, Any]
+    data_window: exr.Window
+    display_window: exr.Window
+
+    @classmethod
+    def of(cls, gbuffer: GBuffer) -> Place:
+        """Where the G-buffer lies."""
+        return cls(gbuffer.placement(), gbuffer.data_window, gbuffer.display_window)
+
+
+def encode(
+    shades: Sequence[Float], made: Sequence[Made], place: Place, asked: ShadeParameters
+) -> tuple[bytes, str]:
+    """The answer's bytes and media type; each of several effects is a layer of its name.
+
+    Its header holds the facts and, as JSON, the plan of each.
+    """
+    if asked.format == "png":
+        return pictures.png(pictures.of_effect(shades[0], EFFECTS[made[0].effect])), "image/png"
+    channels: dict[str, Float] = {}
+    attributes = dict(place.attributes)
+    for shade, each in zip(shades, made, strict=True):
+        layer, key = (f"{each.effect}.", f"{each.effect}:") if len(made) > 1 else ("", "")
+        names = EFFECTS[each.effect].outputs
+        channels |= {f"{layer}{name}": plane for name, plane in zip(names, shade, strict=True)}
+        attributes |= {f"deepshade:{key}{name}": value for name, value in each.facts.items()}
+    if len(made) > 1:
+        attributes["deepshade:effects"] = ",".join(each.effect for each in made)
+    attributes["deepshade:plan"] = json.dumps(plan_of(made), separators=(",", ":"))
+    stream = io.BytesIO()
+    exr.write(
+        stream,
+        channels,
+        attributes=attributes,
+        compression=asked.compression,
+        half=asked.half,
+        data_window=place.data_window,
+        display_window=place.display_window,
+    )
+    return stream.getvalue(), "image/x-exr"
+
+
+def plan_of(made: Sequence[Made]) -> Json:
+    """The plan of an effect, or of each by its name."""
+    return made[0].plan if len(made) == 1 else {each.effect: each.plan for each in made}
