@@ -1,8 +1,9 @@
 """Serve the shipped shaders, shade the sample G-buffers by every effect, compare with references.
 
-`make demo` runs this. For each sample and each effect that it has a reference of, out/demo gets the
-answer as EXR and a picture of ours, the reference and the difference; `nine.png` shows all effects
-of samples/room.exr, ours on the left. `--sheet FILE.webp` writes that for a page.
+`make demo` runs this. Each sample is one request for all effects that it has references of.
+out/demo gets the answer as EXR, a layer an effect, and for each effect a picture of ours, the
+reference and the difference; `nine.png` shows all effects of samples/room.exr, ours on the left.
+`--sheet FILE.webp` writes that for a page.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from rich.table import Table
 from deepshade import exr, judging, metrics, pictures
 from deepshade.bundles import bundle_folders
 from deepshade.effects import EFFECTS, Effect
-from deepshade_client import Answer, Client
+from deepshade_client import Client
+
+Float = NDArray[np.float32]
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent
@@ -52,20 +55,11 @@ def service() -> Iterator[str]:
         process.wait(30)
 
 
-def planes(pixels: dict[str, NDArray[np.float32]], prefix: str = "") -> NDArray[np.float32]:
-    """(3, H, W) of R G B, or (1, H, W) of the one channel."""
-    names = [f"{prefix}{band}" for band in "RGB"]
-    if names[0] not in pixels:
-        names = [name for name in pixels if name.startswith(prefix)][:1]
-    return np.stack([pixels[name] for name in names])
-
-
-def compared(effect: Effect, sample: Path, answer: Answer) -> tuple[list[pictures.Picture], float]:
-    """Ours, the reference and the difference, exposed alike; and the DSSIM."""
-    ours = planes(answer.channels())
-    layer = f"reference_{effect.name}."
-    channels = [name for name in exr.read_header(sample.read_bytes()).channels() if layer in name]
-    reference = planes(exr.read(sample, channels).pixels, layer)
+def compared(effect: Effect, sample: Path, ours: Float) -> tuple[list[pictures.Picture], float]:
+    """Our answer (C, H, W), the reference and the difference, exposed alike; and the DSSIM."""
+    names = [f"reference_{effect.name}.{band}" for band in ("RGB" if len(ours) == 3 else "V")]
+    pixels = exr.read(sample, names).pixels
+    reference = np.stack([pixels[name] for name in names])
     shown, truth = judging.exposed(effect, reference, ours, reference)
     row = [pictures.of_effect(shown, effect), pictures.of_effect(truth, effect)]
     return [*row, pictures.difference(shown, truth)], metrics.dssim(shown, truth)
@@ -93,24 +87,27 @@ def main() -> None:
     asked = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     shipped = {folder.parent.name for folder in bundle_folders(MODELS)}
-    table = Table("sample", "effect", "bundle", "SSIM", "DSSIM", "decode", "infer", "encode")
+    table = Table("sample", "effect", "bundle", "SSIM", "DSSIM", "ms")
     shown: dict[str, list[pictures.Picture]] = {}
     with service() as server, Client(server) as client:
         client.wait_until_ready()
         for sample in SAMPLES:
             layers = "".join(exr.read_header(sample.read_bytes()).channels())
-            for name in (n for n in EFFECTS if n in shipped and f"reference_{n}." in layers):
-                client.shade(name, sample)  # the first answer also compiles
-                answer = client.shade(name, sample)
-                answer.save(OUT / f"{sample.stem}-{name}.exr")
-                row, dssim = compared(EFFECTS[name], sample, answer)
+            names = [n for n in EFFECTS if n in shipped and f"reference_{n}." in layers]
+            client.shade(",".join(names), sample)  # the first answer also compiles
+            answer = client.shade(",".join(names), sample)
+            answer.save(OUT / sample.name)
+            for name, ours in answer.arrays().items():
+                row, dssim = compared(EFFECTS[name], sample, ours)
                 pictures.save(OUT / f"{sample.stem}-{name}.png", pictures.beside(row))
                 shown.setdefault(name, row)
-                times = (
-                    f"{answer.timing[stage]:.1f} ms" for stage in ("decode", "infer", "encode")
-                )
-                figures = f"{1 - 2 * dssim:.4f}", f"{dssim:.4f}"
-                table.add_row(sample.stem, name, answer.facts["bundle"], *figures, *times)
+                alone = len(names) == 1
+                bundle = answer.facts["bundle" if alone else f"{name}.bundle"]
+                ms = answer.timing["infer" if alone else f"infer-{name}"]
+                figures = f"{1 - 2 * dssim:.4f}", f"{dssim:.4f}", f"{ms:.0f}"
+                table.add_row(sample.stem, name, bundle, *figures)
+            for stage in ("decode", "encode"):
+                table.add_row(sample.stem, stage, "", "", "", f"{answer.timing[stage]:.0f}")
     whole = sheet(shown)
     pictures.save(OUT / "nine.png", whole)
     if asked.sheet:

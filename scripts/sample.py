@@ -29,7 +29,7 @@ SCENE, WIDTH, HEIGHT = "procedural:room:7", 512, 384
 EYE, TARGET = (1.4, 1.6, 1.4), (-0.8, 0.6, -0.8)
 RAYS = {"ao": 1024, "dof": 256, "mb": 256}  # a pixel, else
 SAMPLES = 512
-BITS = {"light": 7, "reference": 6}  # that are kept behind the point: 0.4 and 0.8 %
+NOISY = {"do", "full", "gi", "ibl"}  # one to four per cent
 SHIPPED = (
     *("depth", "normal", "diffuse", "specular", "gloss", "scatter"),
     *("motion", "light", "light_diffuse"),
@@ -68,7 +68,7 @@ def main() -> None:
 def write(images: Mapping[str, Float], seen: View) -> None:
     """The file, of what was rendered."""
     channels = {
-        name: coarse(plane, BITS.get(name.partition("_")[0].partition(".")[0], 10))
+        name: coarse(plane, kept(name))
         for name, plane in channels_of(dict(images), SHIPPED, EFFECTS).items()
         if "_error" not in name
     }
@@ -81,9 +81,17 @@ def write(images: Mapping[str, Float], seen: View) -> None:
     )
 
 
-def coarse(plane: Float, kept: int) -> Float:
+def kept(channel: str) -> int:
+    """How many bits behind the point a channel's half floats keep: steps of a noise's size."""
+    kind, _, effect = channel.partition(".")[0].partition("_")
+    if kind not in ("light", "reference"):
+        return 10
+    return 5 if effect in NOISY else 6
+
+
+def coarse(plane: Float, bits_kept: int) -> Float:
     """Half floats rounded to so many bits behind the point; they have 10."""
-    unit = 1 << (10 - kept)
+    unit = 1 << (10 - bits_kept)
     bits = plane.astype(np.float16).view(np.uint16) + np.uint16(unit // 2)
     rounded = bits & np.uint16(0x10000 - unit)
     return rounded.view(np.float16).astype(np.float32)

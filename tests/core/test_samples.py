@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepshade import exr, metrics
+from deepshade import exr
 from deepshade.effects import EFFECTS
 from deepshade.environments import Surroundings, sky
 from deepshade.gbuffer import load_gbuffer
@@ -27,19 +27,19 @@ def test_every_effect_finds_its_inputs_and_its_reference() -> None:
 
 
 def test_references_are_about_what_the_effects_start_from() -> None:
-    # unblocked irradiance of the service's sky, from world-space normals that are derived here
     gbuffer = load_gbuffer(ROOM, ["normal_world", "light"])
-    image = exr.read(ROOM).pixels
-    layers = {
-        name: np.stack([image[f"reference_{name}.{band}"] for band in "RGB"])
-        for name in ("do", "dof", "mb", "aa", "sss")
-    }
-    free = Surroundings(sky(height=512)).irradiance(gbuffer.attributes["normal_world"])
-    opened = image["reference_ao.V"] > 0.97
-    assert layers["do"][:, opened] == pytest.approx(free[:, opened], rel=0.15, abs=0.05)
-    for name in ("dof", "mb", "aa", "sss"):
-        assert (
-            metrics.dssim(*(np.clip(p, 0, 1) for p in (layers[name], gbuffer.attributes["light"])))
-            < 0.2
-        )
-        assert layers[name].mean() == pytest.approx(gbuffer.attributes["light"].mean(), rel=0.03)
+    names = ("do", "dof", "mb", "aa", "sss")
+    wanted = [f"reference_{name}.{band}" for name in names for band in "RGB"]
+    image = exr.read(ROOM, [*wanted, "reference_ao.V"]).pixels
+    opened, *layers = (
+        np.stack([image[f"reference_{name}.{band}"] for band in "RGB"]) for name in names
+    )
+    # where nothing is near, the irradiance of the service's sky over derived normals
+    free = Surroundings(sky(height=128)).irradiance(gbuffer.attributes["normal_world"])
+    clear = image["reference_ao.V"] > 0.98
+    assert clear.mean() > 0.1
+    off = np.abs(opened / free - 1)[:, clear]
+    assert np.quantile(off, 0.95) < 0.1  # the sun may be behind what little is near
+    light = gbuffer.attributes["light"]
+    for layer in layers:
+        assert layer.mean() == pytest.approx(light.mean(), rel=0.03)
