@@ -23,6 +23,7 @@ from deepshade.gbuffer import GBuffer
 from deepshade_service import shading
 from deepshade_service.config import Settings
 from deepshade_service.parameters import ShadeParameters
+from deepshade_trainer.graph import session
 from deepshade_trainer.networks import from_bundle
 
 from .service.conftest import ORDINARY, Local, encode
@@ -195,7 +196,6 @@ def test_light_is_carried_in_every_precision(models: Path, effect: str, backend:
 def test_what_is_calculated_in_16_or_8_bits_never_sees_the_light(models: Path, effect: str) -> None:
     """What the 16-bit part takes and gives stays to the last bit with 1,024 times the light."""
     import onnx
-    import onnxruntime as ort
     from openvino import Core
 
     from deepshade.engines.splitting import split
@@ -208,11 +208,11 @@ def test_what_is_calculated_in_16_or_8_bits_never_sees_the_light(models: Path, e
     names = [*pieces[1].taken, *pieces[1].gives]
     assert pieces[1].taken and pieces[1].gives == bundle.float32_after
     graph.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
-    session = ort.InferenceSession(graph.SerializeToString(), providers=["CPUExecutionProvider"])
+    running = session(graph.SerializeToString())
     inputs = scene(effect)
     brighter = relit(inputs, lambda light: light * 1024)
     plain, bright = (
-        session.run(names, {bundle.input_name: network_input(bundle, each)})
+        running.run(names, {bundle.input_name: network_input(bundle, each)})
         for each in (inputs, brighter)
     )
     for name, before, after in zip(names, plain, bright, strict=True):

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 import torch
 
@@ -29,7 +28,7 @@ from deepshade_trainer.export import (
     parity,
     write_onnx,
 )
-from deepshade_trainer.graph import bytes_per_pixel, float32_marks
+from deepshade_trainer.graph import bytes_per_pixel, float32_marks, session
 from deepshade_trainer.networks import from_bundle
 from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run
@@ -154,8 +153,8 @@ def test_an_empty_run_is_refused(tmp_path: Path) -> None:
 def test_evaluation_equals_the_metrics_by_hand(bundle: Bundle, data: Path) -> None:
     rows = list(evaluate(bundle, [data], limit=3))
     assert len(rows) == 3
-    session = ort.InferenceSession(str(bundle.model), providers=["CPUExecutionProvider"])
-    assert session.get_inputs()[0].shape[1] == 6
+    running = session(bundle.model)
+    assert running.get_inputs()[0].shape[1] == 6
     for row in rows:
         assert row.figures["ssim"] == pytest.approx(metrics.ssim(row.image, row.reference))
         white = np.ones_like(row.reference)

@@ -11,6 +11,7 @@ import torch
 from deepshade.bundles import Bundle
 from deepshade.engines import load_engine, usable
 from deepshade.environments import INPUTS, Environment, Prepared, sky
+from deepshade_trainer.graph import session
 from deepshade_trainer.lookups import lens, picture
 from deepshade_trainer.networks import from_bundle
 from deepshade_trainer.networks.lens import ATTRIBUTES, Lens
@@ -113,7 +114,6 @@ def test_every_engine_gives_the_same(shader: Lens, daylight: dict[str, np.ndarra
 def test_16_and_8_bits_never_see_the_light(daylight: dict[str, np.ndarray]) -> None:
     """What both trunks take and give stays to the last bit with 1,024 times the light."""
     import onnx
-    import onnxruntime as ort
     from openvino import Core
 
     from deepshade.engines.splitting import split
@@ -127,11 +127,11 @@ def test_16_and_8_bits_never_see_the_light(daylight: dict[str, np.ndarray]) -> N
     names = list(dict.fromkeys(n for piece in trunks for n in (*piece.taken, *piece.gives)))
     graph = onnx.load(bundle.model)
     graph.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
-    session = ort.InferenceSession(graph.SerializeToString(), providers=["CPUExecutionProvider"])
+    running = session(graph.SerializeToString())
     feed = {bundle.input_name: picture(ATTRIBUTES, 96), **daylight}
     bright = feed | {"lobes": daylight["lobes"] * 1024}
     for name, before, after in zip(
-        names, session.run(names, feed), session.run(names, bright), strict=True
+        names, running.run(names, feed), running.run(names, bright), strict=True
     ):
         assert (before == after).all(), name
     assert {name.split(".")[0] for name in bundle.int8} == {"occlusion", "blur"}

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 import torch
 
@@ -16,6 +15,7 @@ from deepshade.effects import EFFECTS
 from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.evaluation import evaluate
 from deepshade_trainer.export import load_shader
+from deepshade_trainer.graph import session
 from deepshade_trainer.networks import Shader, build, from_bundle
 from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
@@ -104,8 +104,8 @@ def test_every_effect_trains_and_exports(effect: str, name: str, tmp_path: Path)
         per_channel=bundle.per_channel,
         multiple=bundle.size_multiple,
     )
-    session = ort.InferenceSession(str(bundle.model), providers=["CPUExecutionProvider"])
-    (shade,) = session.run([bundle.output_name], {bundle.input_name: gbuffer})
+    running = session(bundle.model)
+    (shade,) = running.run([bundle.output_name], {bundle.input_name: gbuffer})
     with torch.inference_mode():
         expected = after(torch.from_numpy(gbuffer)).numpy()
     # what is summed up from bright light may cancel: rounding is relative to the brightest
@@ -117,7 +117,7 @@ def test_every_effect_trains_and_exports(effect: str, name: str, tmp_path: Path)
     if isinstance(row.background, float):
         assert shade[:, :, :26] == pytest.approx(row.background, abs=1e-6)
     if bundle.per_channel:  # three runs at once are three single runs
-        single = [session.run(None, {bundle.input_name: one[None]})[0][0] for one in gbuffer]
+        single = [running.run(None, {bundle.input_name: one[None]})[0][0] for one in gbuffer]
         assert np.abs(np.stack(single) - shade).max() <= 1e-5 * max(1, np.abs(shade).max())
     rows = list(evaluate(bundle, [tmp_path / "data" / effect], limit=2))
     figures: dict[str, Any] = rows[0].figures

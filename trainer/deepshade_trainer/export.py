@@ -23,7 +23,13 @@ from deepshade.errors import DataError
 from deepshade.files import replacing
 from deepshade.tensors import up
 from deepshade_trainer.dataset import Dataset, spread
-from deepshade_trainer.graph import bytes_per_pixel, float32_marks, fold_constants, int8_ranges
+from deepshade_trainer.graph import (
+    bytes_per_pixel,
+    float32_marks,
+    fold_constants,
+    int8_ranges,
+    session,
+)
 from deepshade_trainer.networks import Shader, build
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
@@ -164,13 +170,11 @@ def write_onnx(shader: Shader, path: Path) -> Any:
 
 def parity(shader: Shader, path: Path, pictures: Sequence[Tensor]) -> float:
     """Largest difference between ONNX Runtime (CPU, fp32) and torch, of values over 1 relative."""
-    import onnxruntime as ort
-
-    session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    running = session(path)
     worst = 0.0
     with torch.inference_mode():
         for gbuffer in pictures:
-            ours: NDArray[np.float32] = session.run(None, {INPUT: gbuffer.numpy()})[0]
+            ours: NDArray[np.float32] = running.run(None, {INPUT: gbuffer.numpy()})[0]
             theirs = shader(gbuffer).numpy()
             difference = np.abs(ours - theirs) / np.maximum(1, np.abs(theirs))
             worst = max(worst, float(difference.max()))

@@ -18,7 +18,7 @@ from deepshade.environments import INPUTS, Prepared, sky, world_to_map
 from deepshade.errors import DataError
 from deepshade.tensors import up
 from deepshade_trainer.export import INPUT, OPSET, OUTPUT, TOLERANCE, quiet
-from deepshade_trainer.graph import bytes_per_pixel, float32_marks, fold_constants
+from deepshade_trainer.graph import bytes_per_pixel, float32_marks, fold_constants, session
 from deepshade_trainer.networks import from_bundle
 from deepshade_trainer.networks.carrier import Carrier
 from deepshade_trainer.networks.fold_unet import FoldUNet
@@ -92,7 +92,8 @@ def _export(
         raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
     marks = [float32_marks(graph, prefix) for prefix in shader.rounded] or [([OUTPUT], [])]
     further = {name: tensor.numpy() for name, tensor in zip(INPUTS, given[1:], strict=True)}
-    counted = given[0].shape[1], *[up(_COUNTED, shader.size_multiple)] * 2
+    side = up(_COUNTED, shader.size_multiple)
+    counted = given[0].shape[1], side, side
     config = {
         "effect": effect.name,
         "name": folder.name,
@@ -143,15 +144,13 @@ def picture(
 
 def _parity(shader: Reflections | Lens, path: Path, given: list[torch.Tensor]) -> float:
     """Largest difference of both, of values over 1 relative, for a y-up and a z-up world."""
-    import onnxruntime as ort
-
-    session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    running = session(path)
     worst = 0.0
     for axis in ("y", "z"):
         turn = torch.from_numpy(world_to_map(77.0, axis).astype(np.float32))
         inputs = [*given[:-1], turn]
-        feed = {node.name: t.numpy() for node, t in zip(session.get_inputs(), inputs, strict=True)}
-        ours = session.run(None, feed)[0]
+        feed = {node.name: t.numpy() for node, t in zip(running.get_inputs(), inputs, strict=True)}
+        ours = running.run(None, feed)[0]
         with torch.inference_mode():
             theirs = shader(*inputs).numpy()
         difference = np.abs(ours - theirs) / np.maximum(1, np.abs(theirs))

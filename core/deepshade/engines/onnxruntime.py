@@ -66,6 +66,9 @@ def _open(graph: str, engine: str, threads: int) -> Any:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # The memory pattern is planned per input shape and kept; sizes here are ever different.
     options.enable_mem_pattern = False
+    # To plan which tensors share memory takes time by the square of the graph's length, 20 s for
+    # 3,500 nodes, and the arena shares it anyway.
+    options.enable_mem_reuse = False
     # Without its arena every tensor is mapped and faulted in anew, which costs 15-20 % at
     # 768x512. With it, memory stays taken until it is told otherwise: see `shrink`.
     options.enable_cpu_mem_arena = True

@@ -59,7 +59,8 @@ def _stages(
     names = [*float32, *after]
     makers = dict(zip(names, (out.get_node() for out in _tensors(model, names)), strict=True))
     upstream = {name: _upstream([maker]) for name, maker in makers.items()}
-    left, exact, found = {True: list(float32), False: list(after)}, True, []
+    left, exact = {True: list(float32), False: list(after)}, True
+    found: list[tuple[Sequence[str], bool]] = []
     while left[True] or left[False]:
         others = {_name(makers[name]) for name in left[not exact]}
         ready = [n for n in left[exact] if not upstream[n] & (others - {_name(makers[n])})]
