@@ -26,7 +26,7 @@ $(VENV)/stamp-all: pyproject.toml constraints.txt scripts/libllvm.sh
 	$(PIP) -e '.[all,dev]'
 	touch $(VENV)/stamp-serve $@
 
-demo: $(VENV)/stamp-serve ## Serve, shade two sample G-buffers, write pictures to out/demo, stop
+demo: $(VENV)/stamp-serve ## Serve, shade the samples by every effect, write pictures to out/demo, stop
 	$(BIN)/python scripts/demo.py
 
 run: $(VENV)/stamp-serve ## Serve on 127.0.0.1:8000 until Ctrl-C

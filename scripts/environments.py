@@ -19,10 +19,14 @@ from deepshade_trainer.lookups import export_lens, export_reflections
 LOBES = {"balanced": 1, "best": 2}  # lobes that Phong's is replaced by
 CHAINED = "ao/fast", "dof/balanced"
 NOTES = {
-    "ibl": "Look-ups in the environment blurred by cosine lobes; nothing is trained.",
-    "full": "The graphs of `ibl/balanced`, {} and {} in one: the light of the first, times the "
-    "second, through the lens of the third. Nothing more is trained.",
+    "ibl": "Look-ups in the map blurred by cosine lobes; Phong's over a surface is replaced by one "
+    "(`balanced`) or two (`best`) with its moments.",
+    "full": "The light of `ibl/balanced`, times `{}`, through the lens of `{}`, whose weights it "
+    "holds: one graph, of which nothing more is trained.",
 }
+MORE = """ Beside the picture it takes `lobes` (`deepshade.environments.lobes.prefilter`) and `turn`
+(`deepshade.environments.world_to_map`). `python scripts/environments.py` writes this folder;
+[how it works](../../../docs/environments.md)."""
 
 
 def main() -> None:
@@ -40,7 +44,7 @@ def main() -> None:
             bundle, worst = export_lens(folder, *(Bundle.load(root / each) for each in CHAINED))
         if asked.test:
             bundle = measure(bundle, asked.test)
-            write_card(bundle, None, NOTES[bundle.effect].format(*(f"`{e}`" for e in CHAINED)))
+            write_card(bundle, None, NOTES[bundle.effect].format(*CHAINED) + MORE)
         print(f"{folder} ({bundle.short_hash}), {worst:.1e} from torch")
 
 

@@ -1,14 +1,15 @@
-"""Makes the tables and pictures of docs/effects.md: `python -m deepshade_report.effects --help`.
+"""Makes the tables and pictures of documents: `python -m deepshade_report.effects --help`.
 
-Each effect that the document has a mark for is measured as `deepshade report` does, and what
-stands between its marks is replaced; the prose around is the document's own.
+Each effect that one of the documents has a mark for is measured as `deepshade report` does, and
+what stands between its marks is replaced; `overview` and `nine` mark tables of all that were
+measured. The prose around is the document's own.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from deepshade.effects import EFFECTS
 from deepshade.errors import DataError, DeepshadeError
 from deepshade.files import replacing
 from deepshade.machine import cpu_count
+from deepshade.manifest import Manifest
+from deepshade_report.baselines import folder as baselines_of
 from deepshade_report.context import Context, machine
 from deepshade_report.method import NETWORK, PAPER, PAPER_NETWORK
 from deepshade_report.report import measure
@@ -127,12 +130,33 @@ def overview(found: dict[str, Figures]) -> list[str]:
     return lines
 
 
+def nine(found: dict[str, Figures]) -> list[str]:
+    """Markdown: a line for each effect, the paper's own figures beside what was measured here."""
+    lines = [
+        "| | paper: SSIM | ms | doing nothing: SSIM "
+        "| ours: SSIM | error | ms | best rival | error | ms |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for effect, each in found.items():
+        published = getattr(baselines_of(effect), "PUBLISHED", None)
+        theirs = [_three(published[1]), f"{published[0]:.3g}"] if published else ["-", "-"]
+        ssims = [1 - 2 * each.error["trivial_dssim"], 1 - 2 * each.first.error]
+        ours = [f"{100 * each.first.of_trivial:.1f} %", _ms(each.first)]
+        rival = each.rival
+        last = [rival.name, f"{100 * rival.of_trivial:.1f} %", _ms(rival)] if rival else ["-"] * 3
+        row = [EFFECTS[effect].title, *theirs, *(_three(ssim) for ssim in ssims), *ours, *last]
+        lines.append(f"| {' | '.join(row)} |")
+    return lines
+
+
 def draw(context: Context, found: Figures, folder: Path) -> list[str]:
     """Markdown: two held-out views as strips, which are written into `folder`."""
     every, _ = methods(context)
     rival = found.rival if found.rival and found.rival.id in every else None
     shown = [every[found.first.id]] + ([every[rival.id]] if rival else [])
-    names = ["light", "ours", "reference", *([rival.name] if rival else []), "our difference"]
+    names = ["ours", "reference", *([rival.name] if rival else []), "our difference"]
+    if (first := context.views[0].origin) is not None:
+        names.insert(0, first)
     lines: list[str] = []
     folder.mkdir(parents=True, exist_ok=True)
     for number, view in enumerate(chosen(context.views), 1):
@@ -160,47 +184,66 @@ def fragment(context: Context, found: Figures, folder: Path) -> str:
     lines += [f"Means over {views} view{'s' * (views > 1)} of {size} ({scenes}), ± standard error."]
     if views < WANTED:
         lines += [f"These are fewer than the {WANTED} views that such a mean should rest on."]
-    lines += [f"{machine()['processor']}, {threads}, 768 x 512, three channels, all in one run."]
+    lines += [f"{machine()['processor']}, {threads}, whole frames of 768 x 512, all in one run."]
     lines += [f"Left out: {name} ({why})." for name, why in found.missing.items()]
     return "\n".join(lines) + "\n"
 
 
 def write(
-    document: Path, context_of: Callable[[str], Context], *, resume: bool = False
+    documents: Sequence[Path], context_of: Callable[[str], Context], *, resume: bool = False
 ) -> dict[str, str]:
-    """Measure all effects that `document` has marks for and renew it; what went wrong, by effect.
+    """Measure all effects that `documents` have marks for, once, and renew these.
 
-    Pictures go into images/effects beside the document. `resume` keeps what `Context.out` holds.
+    Returns what went wrong, by effect. Pictures go into images/effects beside the first document.
+    `resume` keeps what `Context.out` holds.
     """
-    text = document.read_text("utf-8")
+    texts = {document: document.read_text("utf-8") for document in documents}
     found: dict[str, Figures] = {}
     made: dict[str, str] = {}
     wrong: dict[str, str] = {}
-    for _, name, _ in _MARKED.findall(text):
-        if name not in EFFECTS:
-            continue
+    marked = [name for text in texts.values() for _, name, _ in _MARKED.findall(text)]
+    for name in dict.fromkeys(name for name in marked if name in EFFECTS):
         try:
             context = context_of(name)
             report: dict[str, Any] = measure(context, only=("error", "speed"), resume=resume)
             found[name] = figures = Figures(report["sections"])
-            made[name] = fragment(context, figures, document.parent / "images" / "effects")
+            made[name] = fragment(context, figures, documents[0].parent / "images" / "effects")
         except DeepshadeError as problem:
             wrong[name] = str(problem)
             made[name] = f"Not measured: {problem}.\n"
     made["overview"] = "\n".join(overview(found)) + "\n"
-    renewed = _MARKED.sub(lambda m: m[1] + made.get(m[2], "") + m[3], text)
-    with replacing(document) as part:
-        part.write_text(renewed, "utf-8")
+    made["nine"] = "\n".join([*nine(found), "", _where(found)]) + "\n"
+    for document, text in texts.items():
+        with replacing(document) as part:
+            part.write_text(_MARKED.sub(lambda m: m[1] + made.get(m[2], "") + m[3], text), "utf-8")
     return wrong
+
+
+def data_of(effect: str, folders: Sequence[Path]) -> Path:
+    """The first of the data sets that has the effect's reference, else the first of all."""
+    layer = f"reference_{effect}"
+    return next((f for f in folders if layer in Manifest.read(f).schema), folders[0])
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description="Renews the tables and pictures of a document.")
-    parser.add_argument("--data", type=Path, required=True, help="held-out views")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        nargs="+",
+        required=True,
+        help="held-out views; of several sets an effect's are in the first that has its reference",
+    )
     parser.add_argument("--models", type=Path, default=bundle_root(), help="<effect>/<name>/")
     parser.add_argument("--paper", type=Path, help="<effect>/paper/ lie here (default: --models)")
-    parser.add_argument("--document", type=Path, default=Path("docs/effects.md"))
+    parser.add_argument(
+        "--document",
+        type=Path,
+        nargs="+",
+        default=[Path("docs/effects.md"), Path("README.md")],
+        help="pictures go beside the first",
+    )
     parser.add_argument("--out", type=Path, default=Path("out/effects"), help="reports, by effect")
     parser.add_argument("--threads", type=int, default=cpu_count())
     parser.add_argument("--views", type=int, help="held-out views of an effect, at most")
@@ -212,7 +255,7 @@ def main() -> None:
         paper = asked.paper / effect / PAPER if asked.paper else None
         return Context(
             asked.models,
-            asked.data,
+            data_of(effect, asked.data),
             asked.out / effect,
             paper if paper and paper.is_dir() else None,
             effect,
@@ -224,13 +267,27 @@ def main() -> None:
 
     for effect, why in write(asked.document, context_of, resume=asked.resume).items():
         print(f"{effect} is not measured: {why}")
-    print(f"{asked.document}; differences are shown {GAIN:g} times as large")
+    print(f"{', '.join(map(str, asked.document))}; differences are shown {GAIN:g} times as large")
 
 
 def _line(name: str, point: Point, setting: str) -> str:
     error = _plus(point.error, point.standard_error)
     share, relative = f"{100 * point.of_trivial:.1f} %", _short(point.relative)
     return f"| {name} | {setting} | {error} | {share} | {relative} | {_ms(point)} |"
+
+
+def _where(found: dict[str, Figures]) -> str:
+    """What the figures of all effects have in common."""
+    views = [each.error["views"] for each in found.values()]
+    count = f"{min(views)} to {max(views)}" if len(set(views)) > 1 else str(max(views, default=0))
+    return (
+        f"{count} held-out views an effect; {machine()['processor']}, whole frames of 768 x 512, "
+        "all in one run."
+    )
+
+
+def _three(value: float) -> str:
+    return f"{value:.3f}".removeprefix("0")
 
 
 def _setting(point: Point) -> str:

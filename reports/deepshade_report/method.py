@@ -9,9 +9,10 @@ import numpy as np
 
 from deepshade import tensors
 from deepshade.bundles import Bundle
+from deepshade.camera import camera_to_world
 from deepshade.engines import Engine, choose, load_engine, usable
 from deepshade.errors import DeepshadeError
-from deepshade_report.view import Float, View
+from deepshade_report.view import Float, View, prepared, require
 
 PAPER = "paper"  # the name of the bundle that is a baseline
 NETWORK, PAPER_NETWORK = "network", "paper's network"
@@ -47,9 +48,10 @@ class Network:
         backend = engine.backend
         self.settings = {"engine": backend.engine, "precision": backend.precision}
         self._ready: Float = np.empty((1, 0, 0, 0), np.float32)
+        self._given: dict[str, Float] = {}
 
     def prepare(self, view: View) -> None:
-        """Make the network's input. Raises DeepshadeError for an attribute that the view lacks."""
+        """Make the network's input. Raises DeepshadeError for what the view lacks of it."""
         if missing := [name for name in self.bundle.inputs if name not in view.attributes]:
             raise DeepshadeError(
                 f"bundle {self.bundle.name} needs {', '.join(missing)}, which the views lack",
@@ -63,11 +65,18 @@ class Network:
             per_channel=self.bundle.per_channel,
             multiple=self.bundle.size_multiple,
         )
+        if self.bundle.environment:
+            lit = require(view)
+            tables = prepared(lit.environment)
+            camera = camera_to_world(view.attributes)
+            self._given = tables.inputs(self.bundle.environment, lit.degrees, lit.up, camera)
         self.engine.prepare(*self._ready.shape[2:])
 
     def shade(self, view: View) -> Float:
         """(C, H, W) of the prepared view."""
-        answer = self.engine.predict(self._ready)  # (N, C, h, w), N runs for colour channels
+        answer = self.engine.predict(
+            self._ready, self._given
+        )  # (N, C, h, w), N runs for colour channels
         return answer.reshape(-1, *answer.shape[2:])[:, : view.height, : view.width]
 
 

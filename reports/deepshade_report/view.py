@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,7 +17,7 @@ from deepshade import exr, judging, metrics
 from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS, SETTINGS, Effect
-from deepshade.environments import Surroundings
+from deepshade.environments import Environment, Prepared, Surroundings
 from deepshade.environments.stored import surroundings_of
 from deepshade.errors import DataError
 from deepshade.files import sha256
@@ -81,9 +82,21 @@ class View:
         return judging.relative(self.reference, image)
 
     def light(self) -> Float | None:
-        """(3, H, W) light that the effect starts from, None where it has none."""
+        """(3, H, W) light that the effect starts from, None where it has none.
+
+        Under an environment it is the trivial answer: what reaches surfaces that nothing blocks.
+        """
+        if "environment" in self.effect.settings:
+            return self.trivial()
         names = [name for name in self.effect.inputs if ATTRIBUTES[name].unit is RADIANCE]
         return self.attributes[names[0]] if names else None
+
+    @property
+    def origin(self) -> str | None:
+        """What `light` is, for a page."""
+        if "environment" in self.effect.settings:
+            return "doing nothing"
+        return None if self.light() is None else "light"
 
     def floor(self) -> float | None:
         """What noise in the reference leaves (`judging.floor`); None where no error is known."""
@@ -94,6 +107,19 @@ class View:
     def contrast(self) -> float:
         """What the effect's row compares with `min_contrast`."""
         return judging.contrast(self.effect, self.reference, self.trivial())
+
+
+@lru_cache(maxsize=4)
+def prepared(environment: Environment) -> Prepared:
+    """What graphs and rivals look up in a view's environment."""
+    return Prepared.of(environment)
+
+
+def require(view: View) -> Surroundings:
+    """The view's environment and its turn, or DataError."""
+    if view.surroundings is None:
+        raise DataError("the views are lit by no environment", fix="render them again")
+    return view.surroundings
 
 
 def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View]:

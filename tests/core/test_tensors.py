@@ -7,6 +7,8 @@ from deepshade import tensors
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 
+GOES_ON = {"focal", "view", "light", "normal_world", "diffuse", "specular", "gloss"}
+
 
 def attributes(names, height=6, width=10):
     rng = np.random.default_rng(5)
@@ -27,10 +29,10 @@ def test_a_tensor_is_the_scaled_stack(name):
     )
     assert made.shape == (1, tensors.channel_count(effect.inputs, False), 8, 12)
     assert np.allclose(made[0, :, :6, :10], expected, rtol=1e-6)
-    # past the picture the background's own attributes go on, and nothing else is there
+    # past the picture light and materials go on, and no geometry is there
     for attribute, place in tensors.channel_slices(effect.inputs, False).items():
         inner, below, right = made[0, place, :6, :10], made[0, place, 6:], made[0, place, :6, 10:]
-        if ATTRIBUTES[attribute].in_background:
+        if attribute in GOES_ON:
             assert (below[..., :10] == inner[:, 5:]).all()
             assert (right == inner[..., 9:]).all()
             assert (below[..., 10:] == inner[:, 5:, 9:]).all()

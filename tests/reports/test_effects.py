@@ -43,6 +43,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_data(folder / "data", "gi")
     (folder / "docs").mkdir()
     (folder / "docs" / "effects.md").write_text(DOCUMENT)
+    (folder / "README.md").write_text("<!-- made: nine -->\nto be replaced\n<!-- end -->\n")
     return folder
 
 
@@ -52,7 +53,7 @@ def made(root: Path, paper: bool) -> tuple[str, dict[str, str]]:
         out = root / "out" / str(paper) / effect
         return Context(root / "models", root / "data", out, folder, effect, threads=1, quick=True)
 
-    wrong = effects.write(root / "docs" / "effects.md", context)
+    wrong = effects.write([root / "docs" / "effects.md", root / "README.md"], context)
     return (root / "docs" / "effects.md").read_text(), wrong
 
 
@@ -64,6 +65,8 @@ def test_the_page_says_what_was_measured_and_what_was_not(root: Path) -> None:
     assert "Prose, <!-- kept -->." in text
     assert list(wrong) == ["dof"]
     assert "Not measured" in text.split("<!-- made: dof -->")[1]
+    nine = (root / "README.md").read_text()
+    assert "to be replaced" not in nine
     section = text.split("<!-- made: gi -->")[1].split("<!-- end -->")[0]
     found = json.loads((root / "out" / "True" / "gi" / "report.json").read_text())["sections"]
     views = load_views(root / "data", "gi", 2)
@@ -74,6 +77,11 @@ def test_the_page_says_what_was_measured_and_what_was_not(root: Path) -> None:
         assert row["dssim"] == pytest.approx(np.mean(row["each"]), rel=1e-5)
         assert row["standard_error"] == pytest.approx(error, rel=1e-4, abs=1e-8)
     assert "**`balanced`**" in section
+    ours = found["error"]["data"]["rows"][0]["dssim"]
+    line = next(
+        line for line in nine.splitlines() if line.startswith("| Indirect light | .798 | 60 |")
+    )
+    assert f"| {1 - 2 * ours:.3f} |".replace(" 0.", " .") in line
     assert "the paper's network" in section
     assert "2 views of 64 x 64" in section
     assert "fewer than the 32" in section
@@ -85,6 +93,16 @@ def test_the_page_says_what_was_measured_and_what_was_not(root: Path) -> None:
 
     text, _ = made(root, paper=False)
     assert "Left out: the paper's network (no bundle of it" in text
+
+
+def test_an_effect_s_views_lie_in_the_first_set_that_has_them(root: Path) -> None:
+    write_data(root / "occlusion", "ao")
+    folders = [root / "data", root / "occlusion"]
+    assert [effects.data_of(effect, folders).name for effect in ("gi", "ao", "do")] == [
+        "data",
+        "occlusion",
+        "data",
+    ]
 
 
 def view_of(seed: int) -> View:

@@ -1,6 +1,7 @@
 """Environment maps through the service: listed, used, turned, added, refused."""
 
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,13 +48,9 @@ def lit(start, lookups, maps):
     return start(models=lookups, environments=maps, environment_uploads=True)
 
 
-def ball(view=None, **attributes):
-    planes = iter(picture(40)[0])
-    channels = {
-        channel: next(planes)
-        for name in EFFECTS["ibl"].inputs
-        for channel in ATTRIBUTES[name].channels
-    }
+def ball(inputs=EFFECTS["ibl"].inputs, side=40, **attributes):
+    planes = iter(picture(side, inputs)[0])
+    channels = {channel: next(planes) for name in inputs for channel in ATTRIBUTES[name].channels}
     return encode(channels, attributes=attributes)
 
 
@@ -106,6 +103,27 @@ def test_a_turned_map_is_seen_behind_the_ball(lit, maps):
         found = pixels(shade(lit, environment="noon", half="false", **query))[:, 0, 0]
         ray = -picture(40)[0, 3:6, 0, 0]
         np.testing.assert_allclose(found, environment.sample(np.array(towards(ray))), rtol=0.02)
+
+
+@pytest.mark.slow
+def test_the_shipped_chain_looks_through_the_lens(start, tmp_path):
+    """At any size, by default under the sky; blur circles follow from the request's lens."""
+    (tmp_path / "full").symlink_to(Path(__file__).parents[2] / "models/full")
+    inputs = [name for name in EFFECTS["full"].inputs if name != "focal"]
+    local = start(models=tmp_path)
+
+    def shade(body, **query):
+        asked = {"radius": 1, "fov": 50, "half": "false", **query}
+        return local.client.post("/shade/full", params=asked, content=body, headers=EXR)
+
+    body = ball(inputs, 97)
+    sharp = shade(body, focus=1.7, aperture=0)
+    assert sharp.headers["deepshade-environment"] == "sky"
+    blurred = pixels(shade(body, focus=1, aperture=0.5))
+    assert blurred.shape == (3, 97, 97)
+    steps = [np.abs(np.diff(image[:, 48, :16])).max() for image in (pixels(sharp), blurred)]
+    assert steps[0] > 5 * steps[1]  # the ball's edge against the sky
+    assert "deepshade:focus" in shade(body).json()["detail"]
 
 
 @pytest.mark.slow

@@ -41,7 +41,7 @@ def answer(shader: Lens, gbuffer: np.ndarray, given: dict[str, np.ndarray]) -> n
 
 @pytest.mark.slow
 def test_in_focus_it_is_ibl_times_ao(shader: Lens, daylight: dict[str, np.ndarray]) -> None:
-    gbuffer = picture(ATTRIBUTES, 96)
+    gbuffer = picture(96, ATTRIBUTES)
     gbuffer[:, FOCAL] = 0
     gbuffer[:, 18, :, :48] *= 0.9  # one half nearer: it occludes the other
     inputs = [torch.from_numpy(each) for each in (gbuffer[:, :13], *daylight.values())]
@@ -55,7 +55,7 @@ def test_in_focus_it_is_ibl_times_ao(shader: Lens, daylight: dict[str, np.ndarra
 
 @pytest.mark.slow
 def test_it_is_linear_in_the_environment(shader: Lens, daylight: dict[str, np.ndarray]) -> None:
-    gbuffer = picture(ATTRIBUTES, 64)
+    gbuffer = picture(64, ATTRIBUTES)
     other = daylight["lobes"][:, ::-1] ** 2
     both = {**daylight, "lobes": 300 * daylight["lobes"] + other}
     parts = [
@@ -87,7 +87,7 @@ def test_nothing_farther_than_the_halo_counts(
     shader: Lens, daylight: dict[str, np.ndarray]
 ) -> None:
     """The left part of a wide picture, alone with its halo, is what it is in the whole."""
-    ball = picture(ATTRIBUTES, 64)
+    ball = picture(64, ATTRIBUTES)
     whole = np.concatenate([ball, ball[..., ::-1], ball[..., ::-1, :], *[ball] * 5], axis=3)
     whole[:, FOCAL] += 8
     inner = 128
@@ -101,7 +101,7 @@ def test_nothing_farther_than_the_halo_counts(
 def test_every_engine_gives_the_same(shader: Lens, daylight: dict[str, np.ndarray]) -> None:
     bundle = Bundle.load(SHIPPED)
     assert (bundle.size_multiple, bundle.halo) == (shader.size_multiple, shader.halo)
-    gbuffer = picture(ATTRIBUTES, 96)
+    gbuffer = picture(96, ATTRIBUTES)
     expected = answer(shader, gbuffer, daylight)
     for backend in usable(bundle):
         engine = load_engine(bundle, backend, threads=1)
@@ -128,7 +128,7 @@ def test_16_and_8_bits_never_see_the_light(daylight: dict[str, np.ndarray]) -> N
     graph = onnx.load(bundle.model)
     graph.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
     running = session(graph.SerializeToString())
-    feed = {bundle.input_name: picture(ATTRIBUTES, 96), **daylight}
+    feed = {bundle.input_name: picture(96, ATTRIBUTES), **daylight}
     bright = feed | {"lobes": daylight["lobes"] * 1024}
     for name, before, after in zip(
         names, running.run(names, feed), running.run(names, bright), strict=True

@@ -126,7 +126,7 @@ def test_light_costs_rays_only_where_it_is_asked_for(monkeypatch: pytest.MonkeyP
 
 
 def test_an_attribute_that_needs_a_setting_says_so() -> None:
-    with pytest.raises(ConfigError, match="'focal' needs the header's deepshade:focus"):
+    with pytest.raises(ConfigError, match="'focal' needs the field of view and the lens"):
         seen(open_scene("procedural:crockery:1"), CLOSER, "focal", focus=2.0)
 
 

@@ -89,7 +89,9 @@ def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
         ),
         "",
         f"Sides are padded to multiples of {bundle.size_multiple}; a pixel depends on at most "
-        f"{bundle.halo} pixels around it.",
+        f"{bundle.halo} pixels around it."
+        if bundle.halo
+        else "Any size will do: a pixel depends on itself alone.",
         "",
         *_errors(bundle),
         *_speeds(bundle),

@@ -5,6 +5,7 @@ Nothing is trained here: see `networks.reflections` and `networks.lens`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,7 +24,7 @@ from deepshade_trainer.networks import from_bundle
 from deepshade_trainer.networks.carrier import Carrier
 from deepshade_trainer.networks.fold_unet import FoldUNet
 from deepshade_trainer.networks.lens import Lens
-from deepshade_trainer.networks.reflections import Reflections
+from deepshade_trainer.networks.reflections import ATTRIBUTES, Reflections
 
 GIVEN = ("lobes", "turn")  # of an environment
 _SIDE = 96  # of the picture that parity is proven on
@@ -71,7 +72,7 @@ def _export(
     shader.eval().prepare_export()
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG).unlink(missing_ok=True)  # no bundle while its graph changes
-    given = [torch.from_numpy(picture(effect.inputs, up(_SIDE, shader.size_multiple)))]
+    given = [torch.from_numpy(picture(up(_SIDE, shader.size_multiple), effect.inputs))]
     lit = Prepared.of(sky(height=64)).inputs(GIVEN, 30.0, "y")
     given += [torch.from_numpy(lit[name]) for name in GIVEN]
     free = {2: "height", 3: "width"}
@@ -118,7 +119,7 @@ def _export(
 
 
 def picture(
-    inputs: tuple[str, ...], side: int
+    side: int, inputs: Sequence[str] = ATTRIBUTES
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     """(1, C, side, side) of these attributes: a ball before nothing, glossier to the right.
 

@@ -37,7 +37,7 @@ def split(model: Any, float32: Sequence[str] = (), after: Sequence[str] = ()) ->
 
     pieces: list[Piece] = []
     known: list[str] = []
-    stages: list[tuple[Sequence[str], bool]] = _stages(model, float32, after)
+    stages = _stages(model, float32, after)
     for names, exact in [*stages, ((), bool(after))]:
         part = model.clone()
         outputs = _tensors(part, names) or [node.input_value(0) for node in part.get_results()]

@@ -48,10 +48,12 @@ class Prepared:
     ) -> dict[str, Float]:
         """The inputs of those names, for a world that is `up` up and a map turned by `degrees`.
 
-        `camera` (3, 3) turns camera space into the world (`camera.camera_to_world`).
+        `camera` (3, 3) turns camera space into the world (`camera.camera_to_world`); KeyError where
+        it is missing and needed.
         """
-        turn = world_to_map(degrees, up)
-        turns = {"turn": turn, "camera": turn if camera is None else turn @ camera}
+        turns = {"turn": world_to_map(degrees, up)}
+        if camera is not None:
+            turns["camera"] = turns["turn"] @ camera
         known = {**self.tables, **{name: each.astype(np.float32) for name, each in turns.items()}}
         return {name: known[name] for name in names}
 

@@ -25,12 +25,13 @@ _PIECE = 2**13  # pixels transformed at a time
 _REQUIREMENTS: dict[Requirement, str] = {
     "fov": "the field of view",
     "matrix": "the camera's matrix (worldToCamera)",
-    "lens": "the header's deepshade:focus and deepshade:aperture",
+    "lens": "the field of view and the lens (deepshade:focus and deepshade:aperture)",
 }
 REQUIREMENT_FIXES: dict[Requirement, str] = {
     "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov",
     "matrix": "write the standard header attribute worldToCamera (M44f)",
-    "lens": "write deepshade:focus (distance) and deepshade:aperture (diameter), scene units",
+    "lens": "give the full horizontal angle, the focus distance and the aperture's diameter, or "
+    "write deepshade:fov, deepshade:focus and deepshade:aperture",
 }
 
 

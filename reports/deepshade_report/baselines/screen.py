@@ -20,6 +20,7 @@ from deepshade_report.view import Float, View
 NEAREST = 1.3  # pixels between a pixel and its first sample, so that it never meets itself
 GOLDEN = 0.61803398875
 TINY = 1e-12
+SECTORS = 32  # of a slice, as bits
 
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
@@ -113,6 +114,13 @@ def plane(screen: Screen, eye: Any, facing: Any, index: Any, count: Any) -> tupl
     return sin, cos, length, ahead / dr.maximum(length, TINY)
 
 
+def across(eye: Any, sin: Any, cos: Any) -> Any:
+    """The unit vector of a slice's plane that is square to the eye's ray, along its direction."""
+    towards = cos * eye.x + sin * eye.y
+    scale = dr.rsqrt(dr.maximum(1 - dr.square(towards), TINY))
+    return (mi.Vector3f(cos, sin, 0) - towards * eye) * scale
+
+
 def stride(
     screen: Screen, along: Any, spread: Any, index: Any, step: Any, steps: Any, cos: Any, sin: Any
 ) -> tuple[Any, Any]:
@@ -122,6 +130,11 @@ def stride(
     share = (share - dr.floor(share) + mi.Float(step)) / mi.Float(steps)
     distance = dr.fma(dr.power(share, spread), along, NEAREST)
     return distance * cos, -distance * sin
+
+
+def below(bound: Any) -> Any:
+    """The lowest `bound` of 32 bits, all from 32 on."""
+    return dr.select(bound >= SECTORS, mi.UInt32(0xFFFFFFFF), (mi.UInt32(1) << bound) - 1)
 
 
 def smoothed(screen: Screen, image: Any, blur: int, edge: float, *, bent: bool = False) -> Any:

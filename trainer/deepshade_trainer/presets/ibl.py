@@ -1,12 +1,8 @@
-"""Image-based lighting."""
+"""Image-based lighting: what ships looks its answer up instead (`deepshade_trainer.lookups`)."""
 
-from deepshade_trainer.presets.paper import PAPER
+from deepshade_trainer.presets.paper import paper
 
 PRESETS = {
     "balanced": {},
-    "paper": {
-        **PAPER,
-        "network": {"kind": "chain", "widths": (300,), "kernel": 1, "groups": 3},
-        "batch": 5,
-    },
+    **paper({"kind": "chain", "widths": (300,), "kernel": 1, "groups": 3}, batch=5),
 }

@@ -36,7 +36,7 @@ def hbao(directions: int, steps: int, parameters: Parameters | None = None) -> F
     """HBAO as a Method, with the parameters that were tuned or those given."""
     settings = {"directions": directions, "steps": steps}
     parameters = parameters or Parameters(**tuned(__package__, "hbao"))
-    return marching("HBAO", settings, parameters, _march)
+    return marching("HBAO", settings, parameters, march)
 
 
 TUNABLE = Tunable(partial(hbao, 8, 4), PUBLISHED, RANGES)
@@ -48,7 +48,8 @@ def methods(quick: bool) -> list[Filter]:
 
 
 @dr.syntax
-def _march(screen: Screen, directions: Any, steps: Any, *given: Any) -> Any:
+def march(screen: Screen, directions: Any, steps: Any, *given: Any) -> Any:
+    """Every pixel's openness."""
     radius, falloff, bias, spread, intensity, power = given
     pairs = dr.maximum(directions // 2, 1)
     column, row = screen.pixels()

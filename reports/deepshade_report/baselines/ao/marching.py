@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -56,14 +57,23 @@ def marching(
     every pixel's occlusion of a Screen, these counts and all parameters but the filter's two.
     """
 
-    def shade(screen: Screen, ways: int, steps: int, *given: float) -> Any:
-        *rest, blur, edge = given
-        counts = [dr.opaque(mi.UInt32, count) for count in (ways, steps)]
-        numbers = [dr.opaque(mi.Float, float(value)) for value in rest]
-        image = smoothed(screen, kernel(screen, *counts, *numbers), int(blur), edge)
-        return dr.select(screen.depth > 0, dr.clip(image, 0, 1), 1)
+    return Filter(name, settings, parameters, open_screen, partial(openness, kernel))
 
-    return Filter(name, settings, parameters, open_screen, shade)
+
+def openness(
+    kernel: Callable[..., Any], screen: Screen, ways: int, steps: int, *given: float
+) -> Any:
+    """What such a kernel finds of a Screen, with the values of all Parameters, smoothed.
+
+    Of a kernel that gives more planes, those too; the first is occlusion.
+    """
+    *rest, blur, edge = given
+    counts = [dr.opaque(mi.UInt32, count) for count in (ways, steps)]
+    numbers = [dr.opaque(mi.Float, float(value)) for value in rest]
+    image = smoothed(screen, kernel(screen, *counts, *numbers), int(blur), edge)
+    if not isinstance(image, mi.Float):
+        return image
+    return dr.select(screen.depth > 0, dr.clip(image, 0, 1), 1)
 
 
 def sample(

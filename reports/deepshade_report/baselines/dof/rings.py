@@ -73,7 +73,7 @@ def rings(count: int, half: bool, parameters: Parameters | None = None) -> Filte
     """The gather as a Method, with the parameters that were tuned or those given."""
     parameters = parameters or Parameters(**tuned(__package__, "rings"))
     return Filter(
-        "ring gather", {"rings": count, "half": half}, parameters, upload, _shade, recorded=True
+        "ring gather", {"rings": count, "half": half}, parameters, upload, shade, recorded=True
     )
 
 
@@ -85,7 +85,8 @@ def methods(quick: bool) -> list[Filter]:
     return [rings(count, half) for count, half in (QUICK if quick else SETTINGS)]
 
 
-def _shade(frame: tuple[Grid, Any, Any], count: int, half: bool, *given: float) -> Any:
+def shade(frame: tuple[Grid, Any, Any], count: int, half: bool, *given: float) -> Any:
+    """The blurred light of a frame, by the number of rings and the parameters."""
     grid, light, radius = frame
     numbers = dict(zip(RANGES, (dr.opaque(mi.Float, value) for value in given), strict=True))
     pyramid = build(grid, light, radius)

@@ -25,13 +25,21 @@ import drjit as dr
 
 from deepshade_report.baselines.gi.lit import LEVELS, Lit, open_lit, pyramid
 from deepshade_report.baselines.picture import Filter, mi
-from deepshade_report.baselines.screen import GOLDEN, TINY, plane, smoothed, start, stride
+from deepshade_report.baselines.screen import (
+    GOLDEN,
+    SECTORS,
+    TINY,
+    below,
+    plane,
+    smoothed,
+    start,
+    stride,
+)
 from deepshade_report.tuning import Ranges, Tunable, tuned
 
 # slices and steps to each side, from cheap to best; SSRT3 offers 1 to 4 and 1 to 32
 SETTINGS = ((1, 4), (1, 8), (2, 8), (4, 8), (4, 16), (8, 24))
 QUICK = ((1, 8), (4, 8))
-_SECTORS = 32
 
 
 @dataclass(frozen=True)
@@ -115,7 +123,7 @@ def _march(lit: Lit, levels: Any, places: Any, slices: Any, steps: Any, *given: 
         low = _measure(tilt, up, tilt, -1)
         turns = screen.turn * 5 + mi.Float(index) * GOLDEN
         jitter = turns - dr.floor(turns)
-        per_unit = _SECTORS / share
+        per_unit = SECTORS / share
         covered = mi.UInt32(0)
         light = mi.Color3f(0)
         step = mi.UInt32(0)
@@ -147,7 +155,7 @@ def _march(lit: Lit, levels: Any, places: Any, slices: Any, steps: Any, *given: 
                     sine = dr.safe_sqrt(1 - dr.square(bound))
                     measure = low + side * _measure(bound, sine, tilt, side, up)
                     bounds.append(mi.UInt32(dr.maximum(dr.fma(measure, per_unit, jitter), 0)))
-                most, least = (_below(bounds[1]), _below(bounds[0]))
+                most, least = (below(bounds[1]), below(bounds[0]))
                 bits = (most & ~least) if side == 1 else (least & ~most)
                 fresh = dr.select(near, bits & ~covered, 0)
                 covered |= fresh
@@ -160,7 +168,7 @@ def _march(lit: Lit, levels: Any, places: Any, slices: Any, steps: Any, *given: 
                 weight = dr.select(wanted, weight * dr.rcp(dr.maximum(sent.w, 1)), 0)
                 light = dr.fma(weight, mi.Color3f(sent.x, sent.y, sent.z), light)
             step += 1
-        total = dr.fma(length * share / _SECTORS, light, total)
+        total = dr.fma(length * share / SECTORS, light, total)
         index += 1
     return total * (intensity / mi.Float(slices))
 
@@ -174,8 +182,3 @@ def _measure(cosine: Any, sine: Any, tilt: Any, side: int, up: Any = None) -> An
     up = sine if up is None else up
     slope = dr.acos(dr.clip(cosine, -1, 1)) - sine * cosine
     return 0.5 * dr.fma(up, dr.square(sine), side * tilt * slope)
-
-
-def _below(bound: Any) -> Any:
-    """The lowest `bound` of 32 bits, all from 32 on."""
-    return dr.select(bound >= _SECTORS, mi.UInt32(0xFFFFFFFF), (mi.UInt32(1) << bound) - 1)
