@@ -39,7 +39,7 @@ class Resident(Dataset):
             torch.tensor(self._turn(each), dtype=torch.float32, device=device)
             for each in symmetry.ALL
         ]
-        self._channels = [self._seen(channel) for channel in range(3)] if per_channel else None
+        self._channels = [self._coloured(channel) for channel in range(3)] if per_channel else None
 
     def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """See `Dataset.batch`."""
@@ -89,7 +89,7 @@ class Resident(Dataset):
         ]
         return np.concatenate(parts, 1)[:, :, 0, 0].T
 
-    def _seen(self, channel: int) -> list[int]:
+    def _coloured(self, channel: int) -> list[int]:
         """The channels that a run for one colour channel sees."""
         found: list[int] = []
         for name, place in self._places.items():

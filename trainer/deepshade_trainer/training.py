@@ -25,6 +25,7 @@ from deepshade_trainer.dataset import Batch, Dataset, batches
 from deepshade_trainer.lit import Lit
 from deepshade_trainer.losses import dssim, parse_loss
 from deepshade_trainer.networks import Network, Shader, build, bundle_weights
+from deepshade_trainer.networks.openings import Openings
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
@@ -73,7 +74,7 @@ class _Trainer:
         self.shader = Shader(EFFECTS[recipe.effect], self.network)
         runs = self.shader.per_channel
         self.data: Dataset
-        if self.network.environment:
+        if isinstance(self.network, Openings):
             towards = self.network.towards.numpy(force=True)
             self.data = Lit(folders, recipe.effect, towards, self.network.config.fold)
         elif self.device.type == "cpu":

@@ -38,8 +38,8 @@ class Network(nn.Module, ABC):
         """The input columns that the output column `pixel` depends on (rows are alike)."""
 
     @abstractmethod
-    def forward(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
-        """(N, C, H, W), and what `environment` names, to (N, outputs, H, W)."""
+    def forward(self, gbuffer: Tensor) -> Tensor:
+        """(N, C, H, W) to (N, outputs, H, W). What `environment` names comes after the G-buffer."""
 
     @property
     def halo(self) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -13,6 +15,7 @@ from deepshade.errors import ConfigError
 from deepshade.tensors import channel_slices
 from deepshade_trainer.networks.horizons import covered
 from deepshade_trainer.networks.network import Network
+from deepshade_trainer.networks.openings import Openings
 
 _BLACK = 1e-30  # of radiance
 
@@ -105,12 +108,12 @@ class Shader(nn.Module):
         """
         (height, width), (rows, columns) = gbuffer.shape[2:], irradiance.shape[2:]
         irradiance = F.pad(irradiance, (0, width - columns, 0, height - rows), "replicate")
-        image: Tensor
+        network = cast(Openings, self.network)
         if probes:
             each = list(zip(*probes, strict=True))
-            image, error = self.network.learnt(gbuffer, irradiance, through, each)
+            image, error = network.learnt(gbuffer, irradiance, through, each)
         else:
-            image, error = self.network.lit(gbuffer, irradiance, through), torch.zeros(())
+            image, error = network.lit(gbuffer, irradiance, through), torch.zeros(())
         return image.reshape(-1, 3, *image.shape[2:]), error
 
     def curve(self, image: Tensor) -> Tensor:
