@@ -10,9 +10,9 @@ import torch
 
 from deepshade.bundles import Bundle
 from deepshade.engines import load_engine, usable
-from deepshade.environments import INPUTS, Environment, Prepared, sky
+from deepshade.environments import Environment, Prepared, sky
 from deepshade_trainer.graph import session
-from deepshade_trainer.lookups import lens, picture
+from deepshade_trainer.lookups import GIVEN, lens, picture
 from deepshade_trainer.networks import from_bundle
 from deepshade_trainer.networks.lens import ATTRIBUTES, Lens
 from deepshade_trainer.networks.reflections import Reflections
@@ -29,7 +29,7 @@ def shader() -> Lens:
 
 @pytest.fixture(scope="module")
 def daylight() -> dict[str, np.ndarray]:
-    return Prepared.of(sky(height=32)).inputs(INPUTS, 20.0, "y")
+    return Prepared.of(sky(height=32)).inputs(GIVEN, 20.0, "y")
 
 
 def answer(shader: Lens, gbuffer: np.ndarray, given: dict[str, np.ndarray]) -> np.ndarray:
@@ -78,7 +78,7 @@ def test_the_white_furnace(shader: Lens) -> None:
     gbuffer[:, 16], gbuffer[:, 17] = across, -across[:, None]
     gbuffer[:, 18] = -4
     gbuffer[:, FOCAL] = np.linspace(-30, 30, side)
-    found = answer(shader, gbuffer, white.inputs(INPUTS, 0.0, "y"))
+    found = answer(shader, gbuffer, white.inputs(GIVEN, 0.0, "y"))
     assert found == pytest.approx(0.6, rel=0.03)
 
 

@@ -12,7 +12,6 @@ from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade.engines import load_engine, usable
 from deepshade.environments import (
-    INPUTS,
     Environment,
     Prepared,
     directions,
@@ -23,7 +22,7 @@ from deepshade.environments import (
 from deepshade.environments.stored import store
 from deepshade.manifest import Manifest, Shard
 from deepshade_trainer.evaluation import evaluate
-from deepshade_trainer.lookups import export_reflections, picture
+from deepshade_trainer.lookups import GIVEN, export_reflections, picture
 from deepshade_trainer.networks import phong
 from deepshade_trainer.networks.reflections import Reflections
 
@@ -72,7 +71,7 @@ def gbuffer(normal, view, diffuse, specular, gloss):
 
 
 def answer(shader, prepared, planes, degrees=0.0, up="y"):
-    given = [torch.from_numpy(each) for each in prepared.inputs(INPUTS, degrees, up).values()]
+    given = [torch.from_numpy(each) for each in prepared.inputs(GIVEN, degrees, up).values()]
     with torch.inference_mode():
         return shader(torch.from_numpy(planes), *given).numpy()[0, :, 0]
 
@@ -182,7 +181,7 @@ def test_turned_is_as_from_elsewhere(shaders, soft, degrees, up):
 @pytest.mark.slow
 def test_every_engine_gives_the_same(tmp_path, shaders, soft):
     bundle, _ = export_reflections(tmp_path / "ibl" / "small", lobes=1)
-    assert Bundle.load(bundle.path).environment == tuple(INPUTS)
+    assert Bundle.load(bundle.path).environment == tuple(GIVEN)
     planes = picture(48)
     given = soft.inputs(bundle.environment, 20.0, "z")
     with torch.inference_mode():
@@ -203,7 +202,7 @@ def test_every_engine_gives_the_same(tmp_path, shaders, soft):
 def test_samples_are_judged_under_their_own_environment(tmp_path, shaders, soft):
     """A data set whose references are the answers themselves, under a turned map."""
     planes = picture(48)
-    given = soft.inputs(INPUTS, 65.0, "y")
+    given = soft.inputs(GIVEN, 65.0, "y")
     with torch.inference_mode():
         inputs = [torch.from_numpy(each) for each in (planes, *given.values())]
         sample = {"reference_ibl": shaders[1](*inputs).numpy()[0]}
