@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +136,11 @@ def test_a_served_answer_is_the_networks(models: Path, local: Local, effect: str
     planes = [tensors.planes(inputs, bundle.inputs, scale, channel=run) for run in runs]
     given = np.concatenate([tensors.cut(each, (0, rows, 0, columns)) for each in planes])
     light = Prepared.of(sky(height=512)) if bundle.environment else None
-    more = light.inputs(bundle.environment, 0.0, "y", camera_to_world(inputs)) if light else {}
+    more = (
+        light.inputs(bundle.environment, 0.0, "y", partial(camera_to_world, inputs))
+        if light
+        else {}
+    )
     with torch.inference_mode():
         shader = from_bundle(bundle.path)
         answered = shader(*map(torch.from_numpy, (given, *more.values())))

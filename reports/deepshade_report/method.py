@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,7 +13,8 @@ from deepshade.bundles import Bundle
 from deepshade.camera import camera_to_world
 from deepshade.engines import Engine, choose, load_engine, usable
 from deepshade.errors import DeepshadeError
-from deepshade_report.view import Float, View, prepared, require
+from deepshade_report.view import Float, View, require
+from deepshade_trainer.evaluation import prepared
 
 PAPER = "paper"  # the name of the bundle that is a baseline
 NETWORK, PAPER_NETWORK = "network", "paper's network"
@@ -68,15 +70,14 @@ class Network:
         if self.bundle.environment:
             lit = require(view)
             tables = prepared(lit.environment)
-            camera = camera_to_world(view.attributes)
+            camera = partial(camera_to_world, view.attributes)
             self._given = tables.inputs(self.bundle.environment, lit.degrees, lit.up, camera)
         self.engine.prepare(*self._ready.shape[2:])
 
     def shade(self, view: View) -> Float:
         """(C, H, W) of the prepared view."""
-        answer = self.engine.predict(
-            self._ready, self._given
-        )  # (N, C, h, w), N runs for colour channels
+        # (N, C, h, w), N runs for colour channels
+        answer = self.engine.predict(self._ready, self._given)
         return answer.reshape(-1, *answer.shape[2:])[:, : view.height, : view.width]
 
 

@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,7 +16,7 @@ from deepshade import exr, judging, metrics
 from deepshade.attributes import ATTRIBUTES, RADIANCE
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS, SETTINGS, Effect
-from deepshade.environments import Environment, Prepared, Surroundings
+from deepshade.environments import Surroundings
 from deepshade.environments.stored import surroundings_of
 from deepshade.errors import DataError
 from deepshade.files import sha256
@@ -107,12 +106,6 @@ class View:
     def contrast(self) -> float:
         """What the effect's row compares with `min_contrast`."""
         return judging.contrast(self.effect, self.reference, self.trivial())
-
-
-@lru_cache(maxsize=4)
-def prepared(environment: Environment) -> Prepared:
-    """What graphs and rivals look up in a view's environment."""
-    return Prepared.of(environment)
 
 
 def require(view: View) -> Surroundings:

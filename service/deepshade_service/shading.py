@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,7 +205,7 @@ def lit(
 ) -> ShadePlan:
     """The plan with its lighting: the world's up axis is the one asked for, else the renderer's."""
     lighting = Lighting(prepared.environment, asked.rotate or 0.0, asked.up or gbuffer.up)
-    camera = camera_to_world(gbuffer.attributes, gbuffer.camera)
+    camera = partial(camera_to_world, gbuffer.attributes, gbuffer.camera)
     given = prepared.inputs(bundle.environment, lighting.rotate, lighting.up, camera)
     return replace(plan, lighting=lighting, given=given)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +65,8 @@ class Row:
 
 
 @lru_cache(maxsize=8)  # about 75 MB each
-def _prepared(environment: Environment) -> Prepared:
+def prepared(environment: Environment) -> Prepared:
+    """What graphs and rivals look up in an environment; that of a few stays in memory."""
     return Prepared.of(environment)
 
 
@@ -94,9 +95,8 @@ class Shaded:
         if names := self.bundle.environment:
             if lit is None:
                 raise DataError(f"the samples have no environment, which {self.bundle.name} needs")
-            given = _prepared(lit.environment).inputs(
-                names, lit.degrees, lit.up, camera_to_world(sample)
-            )
+            camera = partial(camera_to_world, sample)
+            given = prepared(lit.environment).inputs(names, lit.degrees, lit.up, camera)
         shaded: Image = self.engine.predict(gbuffer, given)
         return shaded.reshape(-1, *shaded.shape[2:])[:, :height, :width]
 

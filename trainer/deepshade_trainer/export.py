@@ -182,7 +182,7 @@ def some_light(shader: Shader) -> dict[str, NDArray[np.float32]]:
     if not shader.network.environment:
         return {}
     camera = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    return Prepared.of(sky(height=64)).inputs(shader.network.environment, 30.0, "y", camera)
+    return Prepared.of(sky(height=64)).inputs(shader.network.environment, 30.0, "y", lambda: camera)
 
 
 def parity(shader: Shader, path: Path, pictures: Sequence[Tensor]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,19 +41,19 @@ class Prepared:
 
     def inputs(
         self,
-        names: Iterable[str],
+        names: Collection[str],
         degrees: float,
         up: Up,
-        camera: NDArray[np.floating] | None = None,
+        camera: Callable[[], NDArray[np.floating]] | None = None,
     ) -> dict[str, Float]:
         """The inputs of those names, for a world that is `up` up and a map turned by `degrees`.
 
-        `camera` (3, 3) turns camera space into the world (`camera.camera_to_world`); KeyError where
-        it is missing and needed.
+        `camera` gives the (3, 3) that turns camera space into the world (`camera.camera_to_world`),
+        and is called if a name needs it; KeyError where it is missing then.
         """
         turns = {"turn": world_to_map(degrees, up)}
-        if camera is not None:
-            turns["camera"] = turns["turn"] @ camera
+        if camera is not None and "camera" in names:
+            turns["camera"] = turns["turn"] @ camera()
         known = {**self.tables, **{name: each.astype(np.float32) for name, each in turns.items()}}
         return {name: known[name] for name in names}
 

@@ -19,7 +19,8 @@ from deepshade.camera import rotation_of
 from deepshade.environments import Environment, world_to_map
 from deepshade.environments.lobes import TILES
 from deepshade_report.baselines.picture import mi
-from deepshade_report.view import View, prepared, require
+from deepshade_report.view import View, require
+from deepshade_trainer.evaluation import prepared
 
 MEAN, MIRROR = 0, len(TILES) - 1  # tiles; that of the exponent 2^k is k + 1
 

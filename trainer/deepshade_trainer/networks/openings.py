@@ -50,9 +50,9 @@ class OpeningsConfig:
     fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
     detail: tuple[int, ...] = (1, 1)
     bias: float = 0.85
-    world: int | None = 0
-    normal: int | None = 3
-    position: int | None = 6
+    world: int = 0
+    normal: int = 3
+    position: int = 6
 
     def __post_init__(self) -> None:
         """Raise ConfigError where entries don't fit each other."""
@@ -60,9 +60,9 @@ class OpeningsConfig:
         for name in ("features", "directions"):
             if getattr(self, name) < 1:
                 raise ConfigError(name, detail=f"{name} must be 1 or more")
-        if self.fold % 2 or self.world is None:
-            raise ConfigError("fold", detail="it needs normals of the world and an even fold")
-        if self.normal is None or self.normal + 3 != self.position:
+        if self.fold % 2:
+            raise ConfigError("fold", detail="fold must be even")
+        if self.normal + 3 != self.position:
             raise ConfigError("position", detail="positions must follow normals")
         _ = self.trunk
 
@@ -115,7 +115,7 @@ class Openings(Network):
         the map (3, 3), to (1, 3, H, W)."""
         lobes, turn, camera = given
         with full_precision():
-            start = self.config.world or 0
+            start = self.config.world
             normal = gbuffer[:, start : start + 3]
             seen = blurred(lobes, turned(normal, turn), 0)
             around = mean(lobes)
@@ -135,7 +135,7 @@ class Openings(Network):
 
     def told(self, gbuffer: Tensor) -> tuple[Tensor, Tensor]:
         """Ambient occlusion (N, 1, H, W), and features (N, features, h, w) of cells."""
-        occlusion, features = self.trunk(gbuffer, self.config.normal or 0)
+        occlusion, features = self.trunk(gbuffer, self.config.normal)
         return occlusion, features.float()
 
     def learnt(
@@ -164,7 +164,7 @@ class Openings(Network):
         towards: Tensor,
         shares: Tensor,
     ) -> Tensor:
-        fold, first = self.config.fold, self.config.normal or 0
+        fold, first = self.config.fold, self.config.normal
         row, column = (int(v) for v in at)
         cells = gbuffer[:, row::fold, column::fold].flatten(1)  # (C, cells)
         normal = unit(cells[None, first : first + 3, None])[0, :, 0]
@@ -189,7 +189,7 @@ class Openings(Network):
         irradiance: Tensor,
         through: Tensor,
     ) -> Tensor:
-        config, first = self.config, self.config.normal or 0
+        config, first = self.config, self.config.normal
         with full_precision():
             count, colours, _ = through.shape
             high, wide = features.shape[2:]
@@ -211,7 +211,7 @@ class Openings(Network):
             return irradiance + inside * ((occlusion - 1) * irradiance + learnt)
 
     def _covered(self, gbuffer: Tensor) -> Tensor:
-        last = (self.config.position or 0) + 2
+        last = self.config.position + 2
         return covered(gbuffer[:, last : last + 1])
 
     def prepare_export(self) -> None:

@@ -23,6 +23,8 @@ _SURFACE = 0.25  # the square of a normal's length; background has none
 _TINY = 1e-12
 _SHARP = len(TILES) - 1  # the tile of the map itself
 
+Number = Tensor | int
+
 
 class Reflections(nn.Module):
     """A G-buffer (`ATTRIBUTES`), an environment's table and a turn to radiance,
@@ -55,8 +57,8 @@ class Reflections(nn.Module):
         normal, view, diffuse, specular, gloss = (gbuffer[:, at] for at in self.places.values())
         square = _dot(normal, normal)
         surface = square > _SURFACE
-        normal = _turned(normal, turn) * torch.rsqrt(square.clamp_min(_TINY))
-        view = _turned(view, turn)
+        normal = turned(normal, turn) * torch.rsqrt(square.clamp_min(_TINY))
+        view = turned(view, turn)
         unseen = _dot(view, view) < _SURFACE
         mu = _dot(normal, view).clamp(-1, 1)
         mirrored = 2 * mu * normal - view  # background, whose normal is 0, looks straight on
@@ -76,7 +78,7 @@ class Reflections(nn.Module):
             seen = self._between(table, towards + aside, index, part)
             seen = 0.5 * (seen + self._between(table, towards - aside, index, part))
         shine = torch.where(surface, specular, 1) * (share.clamp_min(0) * seen)
-        spread = self._look(table, _angles(normal), self.row[1], self.column[1], self.rows[1])
+        spread = blurred(table, normal, 0)
         return diffuse * spread + shine
 
     def prepare_export(self) -> None:
@@ -96,30 +98,15 @@ class Reflections(nn.Module):
         for place in (index, (index + 1).clamp_max(_SHARP)):
             number = place.long()
             pair.append(
-                self._look(table, angles, self.row[number], self.column[number], self.rows[number])
+                _look(table, angles, self.row[number], self.column[number], self.rows[number])
             )
         return pair[0] + (pair[1] - pair[0]) * part
-
-    def _look(
-        self,
-        table: Tensor,
-        angles: tuple[Tensor, Tensor],
-        row: Tensor,
-        column: Tensor,
-        rows: Tensor,
-    ) -> Tensor:
-        u, v = angles
-        x = (column + 2 * rows * u) * (2 / WIDTH) - 1
-        y = (row + rows * v) * (2 / HEIGHT) - 1
-        return _sampled(table, x, y, align_corners=False)
 
 
 def blurred(table: Tensor, directions: Tensor, level: int) -> Tensor:
     """A(d, 2^level) (1, 3, H, W) for `directions` (1, 3, H, W) of the map, of any length but 0."""
-    tile, (u, v) = TILES[1 + level], _angles(directions)
-    x = (tile.column + 2 * tile.rows * u) * (2 / WIDTH) - 1
-    y = (tile.row + tile.rows * v) * (2 / HEIGHT) - 1
-    return _sampled(table, x, y, align_corners=False)
+    tile = TILES[1 + level]
+    return _look(table, _angles(directions), tile.row, tile.column, tile.rows)
 
 
 def mean(table: Tensor) -> Tensor:
@@ -128,9 +115,14 @@ def mean(table: Tensor) -> Tensor:
     return table[:, :, tile.row : tile.row + 1, tile.column : tile.column + 1]
 
 
-def turned(vectors: Tensor, turn: Tensor) -> Tensor:
-    """`vectors` (1, 3, H, W) by a (3, 3) matrix."""
-    return _turned(vectors, turn)
+def _look(
+    table: Tensor, angles: tuple[Tensor, Tensor], row: Number, column: Number, rows: Number
+) -> Tensor:
+    """(1, 3, H, W): a tile of the table, or one for each pixel, at `_angles`."""
+    u, v = angles
+    x = (column + 2 * rows * u) * (2 / WIDTH) - 1
+    y = (row + rows * v) * (2 / HEIGHT) - 1
+    return _sampled(table, x, y, align_corners=False)
 
 
 def _sampled(picture: Tensor, x: Tensor, y: Tensor, *, align_corners: bool) -> Tensor:
@@ -161,7 +153,7 @@ def _atan2(y: Tensor, x: Tensor) -> Tensor:
     return torch.where(y < 0, -angle, angle)
 
 
-def _turned(vectors: Tensor, turn: Tensor) -> Tensor:
+def turned(vectors: Tensor, turn: Tensor) -> Tensor:
     """(1, 3, H, W) by a (3, 3) matrix."""
     columns = turn.reshape(1, 3, 3, 1, 1)
     return sum(columns[:, :, k] * vectors[:, k : k + 1] for k in range(3))  # type: ignore[return-value]
