@@ -16,7 +16,7 @@ from fastapi.responses import HTMLResponse, PlainTextResponse
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
-from deepshade.effects import EFFECTS, SETTINGS, Effect, Setting
+from deepshade.effects import EFFECTS, SETTINGS, Setting
 from deepshade.engines import Engine
 from deepshade.errors import EngineError
 from deepshade.machine import trim
@@ -225,16 +225,13 @@ def _effect(name: str, models: Models) -> dict[str, Any]:
         "outputs": effect.outputs,
         "reference": effect.reference,
         "background": effect.background,
-        "settings": [_setting(s, models, effect) for s in SETTINGS.values() if effect.takes(s)],
+        "settings": [_setting(s) for s in SETTINGS.values() if effect.takes(s)],
         "bundles": [_bundle(bundle, models) for bundle in models.bundles(name)],
     }
 
 
-def _setting(setting: Setting, models: Models, effect: Effect) -> dict[str, Any]:
+def _setting(setting: Setting) -> dict[str, Any]:
     """Without it, what an image's `header` says counts, else the `default`."""
-    default = setting.default
-    if setting.name == "radius" and (bundles := models.bundles(effect.name)):
-        default = bundles[0].radius
     return {
         "name": setting.name,
         "unit": setting.unit,
@@ -242,7 +239,7 @@ def _setting(setting: Setting, models: Models, effect: Effect) -> dict[str, Any]
         "lowest": setting.lowest,
         "highest": setting.highest,
         "header": setting.header if setting.stored else None,
-        "default": default,
+        "default": setting.default,
     }
 
 

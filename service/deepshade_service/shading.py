@@ -21,13 +21,14 @@ from deepshade.environments import Prepared
 from deepshade.gbuffer import GBuffer
 from deepshade.machine import trim
 from deepshade_service.answers import Made, Place, Shaded, encode, plan_of
-from deepshade_service.decoding import decode, read_headers, stored
+from deepshade_service.decoding import decode, read_headers
 from deepshade_service.environments import DEFAULT, Environments
 from deepshade_service.memory import MemoryBudget, Need, need_of, size_of
 from deepshade_service.models import Models
 from deepshade_service.parameters import LIGHT, ShadeParameters
 from deepshade_service.plan import Lighting, ShadePlan, explain, facts_of
 from deepshade_service.problems import Problem
+from deepshade_service.radius import radius_of
 from deepshade_service.selection import Candidate, Selection, select
 from deepshade_service.telemetry import Stopwatch
 from deepshade_service.tiles import plan_tiles
@@ -186,18 +187,16 @@ def run(
 def plan_shading(
     gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters, max_pixels: int
 ) -> ShadePlan:
-    """What to compute, in tiles of at most `max_pixels`.
+    """What to compute, in tiles of at most `max_pixels`, all at the radius of the whole picture.
 
-    The radius is the one asked for, else the header's, else the bundle's. A tile that would only
-    answer background is left out, where the effect says what stands there. Raises Problem 422
-    for an impossible radius in the header.
+    A tile that would only answer background is left out, where the effect says what stands there.
+    Raises Problem 422 for an impossible radius in the header.
     """
-    radius, source = _radius(gbuffer, bundle, asked)
     grid = plan_tiles(*gbuffer.shape, bundle.size_multiple, bundle.halo, max_pixels)
     tiles = tuple(grid)
     if EFFECTS[bundle.effect].background != "shaded":
         tiles = tuple(tile for tile in tiles if not gbuffer.background[tile.answered].all())
-    return ShadePlan(radius, source, grid.shape, tiles)
+    return ShadePlan(radius_of(gbuffer, bundle, asked), grid.shape, tiles)
 
 
 def lit(
@@ -218,7 +217,7 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
     """
     bundle = engine.bundle
     effect = EFFECTS[bundle.effect]
-    scale = tensors.length_scale(effect, gbuffer.attributes, plan.radius)
+    scale = tensors.length_scale(effect, gbuffer.attributes, plan.radius.value)
     shade = np.empty((len(effect.outputs), *gbuffer.shape), np.float32)
     for channel in range(3) if bundle.per_channel else (None,):
         planes = tensors.planes(gbuffer.attributes, bundle.inputs, scale, channel=channel)
@@ -258,13 +257,3 @@ def _giving_back(jobs: Sequence[Job], held: int) -> Iterator[None]:
             for engine in engines:
                 engine.shrink()
             trim()
-
-
-def _radius(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> tuple[float, str]:
-    setting = SETTINGS["radius"]
-    if not EFFECTS[bundle.effect].takes(setting):
-        return bundle.radius, "bundle"
-    if asked.radius is not None:
-        return asked.radius, "request"
-    radius = stored(gbuffer, setting, "; ?radius= overrides it")
-    return (bundle.radius, "bundle") if radius is None else (radius, "header")
