@@ -53,14 +53,16 @@ class MissingAttributeError(DeepshadeError):
         near: Mapping[str, Sequence[str]] | None = None,
         *,
         why: Mapping[str, str] | None = None,
+        instead: str = "",
     ) -> None:
         near = {name: tuple(close) for name, close in (near or {}).items() if close}
         reasons = {name: f" ({why[name]})" for name in missing if why and why.get(name)}
         lacking = ", ".join(f"'{name}'{reasons.get(name, '')}" for name in missing)
         super().__init__(
             f"missing {lacking}; channels found: {_shortened(found) or 'none'}",
-            fix=_mapping_hint(missing, near),
+            fix="; ".join(filter(None, (instead, _mapping_hint(missing, near)))),
         )
+        self.instead = instead
         self.missing = tuple(missing)
         self.found = tuple(found)
         self.near = near

@@ -40,12 +40,10 @@ def radius_of(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> Radiu
     if value is None:
         value, source = Share(_SETTING.share), "depth"
     depth = tensors.median_depth(gbuffer.attributes)
-    if depth is None:
-        return (
-            Radius(bundle.radius, "bundle") if isinstance(value, Share) else Radius(value, source)
-        )
     if not isinstance(value, Share):
-        return Radius(value, source, warning=_warning(value, depth))
+        return Radius(value, source, warning=_warning(value, depth) if depth else "")
+    if depth is None:
+        return Radius(bundle.radius, "bundle")
     radius = _part(value, depth)
     derived = f"{radius:g}, {_percent(value)} of the median depth {depth:.4g}"
     return Radius(radius, source, derived, _warning(radius, depth))

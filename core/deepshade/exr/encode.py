@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from deepshade import floats
 from deepshade.exr.chunks import LONG_NAMES, MAGIC, Window
+from deepshade.exr.entries import Entry
 from deepshade.threads import run_all, thread_count
 
 # name -> (code, scanlines in one chunk)
@@ -53,7 +54,7 @@ def encode(
 
     `channels` are (H, W) arrays of numbers, of the size of `data_window`; those in `half` are
     stored in 16 bits, the others in 32. `compression` is one of `COMPRESSIONS`. `attributes` are
-    int, float, str, and arrays that are int32 (2,) or (3,), or float32 (2,), (3,), (3, 3) or
+    int, float, str, Entry, and arrays that are int32 (2,) or (3,), or float32 (2,), (3,), (3, 3) or
     (4, 4). Raises ValueError for names or attributes that no such file can hold.
     """
     code, lines = COMPRESSIONS[compression]
@@ -163,6 +164,8 @@ def _name(name: str) -> bytes:
 
 def _value(value: Any) -> tuple[str, bytes]:
     """An attribute's type and bytes."""
+    if isinstance(value, Entry):
+        return value.kind, value.data
     if isinstance(value, int):
         return "int", struct.pack("<i", value)
     if isinstance(value, str):

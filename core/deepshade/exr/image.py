@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -18,6 +19,7 @@ from deepshade.errors import ImageError
 from deepshade.exr import encode as exrencode
 from deepshade.exr.chunks import Window
 from deepshade.exr.decode import Wanted, decode
+from deepshade.exr.entries import Entry
 from deepshade.exr.header import MAX_COORDINATE, WRITABLE, Header, parse
 from deepshade.exr.limits import Limits
 from deepshade.files import replacing
@@ -121,8 +123,9 @@ def write(
     stored in 16 bits: all, none, or those named; finite values beyond ±65504 are clamped there
     rather than turned into infinities. Windows are (x0, y0, x1, y1), inclusive: where the pixels
     lie, and the whole frame; each begins at (0, 0) and has the image's size by default.
-    `attributes` are numbers, strings, 2- or 3-vectors, 3x3 or 4x4 matrices; an integer beyond
-    32 bits is stored as text. A path is replaced atomically: written beside, synced, renamed.
+    `attributes` are numbers, strings, 2- or 3-vectors, 3x3 or 4x4 matrices, and entries of another
+    file; an integer beyond 32 bits is stored as text. A path is replaced atomically: written
+    beside, synced, renamed.
     Raises ValueError for arrays or settings that no EXR can hold.
     """
     if compression not in COMPRESSIONS:
@@ -151,7 +154,7 @@ def write(
             name: floats.to_half(plane) if name in halves else np.ascontiguousarray(plane, "f4")
             for name, plane in planes.items()
         }
-        settings = header | {
+        settings = _for_library(header) | {
             "compression": COMPRESSIONS[compression],
             "type": OpenEXR.scanlineimage,
             "dataWindow": _corners(data),
@@ -197,7 +200,7 @@ def _attribute(key: str, value: Any) -> Any:
         return int(value) if -(2**31) <= value < 2**31 else str(value)
     if isinstance(value, (float, np.floating)):
         return float(value)
-    if isinstance(value, str):
+    if isinstance(value, str | Entry):
         return value
     if isinstance(value, (np.ndarray, Sequence)) and not isinstance(value, bytes):
         array = np.asarray(value)
@@ -205,6 +208,18 @@ def _attribute(key: str, value: Any) -> Any:
             whole = array.dtype.kind in "iu" and array.ndim == 1
             return np.ascontiguousarray(array, np.int32 if whole else np.float32)
     raise ValueError(f"the header attribute '{key}' can't hold {value!r:.60}")
+
+
+def _for_library(header: dict[str, Any]) -> dict[str, Any]:
+    """Attributes as the library takes them: entries as it reads them from a file of a pixel."""
+    entries = {name: value for name, value in header.items() if isinstance(value, Entry)}
+    if not entries:
+        return header
+    pixel, window = {"Y": np.zeros((1, 1), np.float32)}, (0, 0, 0, 0)
+    body = b"".join(exrencode.encode(pixel, (), window, window, "zips", entries))
+    with OpenEXR.File(io.BytesIO(body), header_only=True) as file:
+        read = file.header()
+        return header | {name: read[name] for name in entries}
 
 
 def _checked_window(name: str, window: Window) -> Window:

@@ -7,7 +7,7 @@ Adding a derivation is adding a row. Everything is camera space unless it says w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -23,13 +23,13 @@ Requirement = Literal["fov", "matrix", "lens"]
 _PIECE = 2**13  # pixels transformed at a time
 
 _REQUIREMENTS: dict[Requirement, str] = {
-    "fov": "the field of view",
-    "matrix": "the camera's matrix (worldToCamera)",
+    "fov": "the field of view (--fov)",
+    "matrix": "the camera's matrix (--world-to-camera)",
     "lens": "the field of view and the lens (deepshade:focus and deepshade:aperture)",
 }
 REQUIREMENT_FIXES: dict[Requirement, str] = {
     "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov",
-    "matrix": "write the standard header attribute worldToCamera (M44f)",
+    "matrix": "give it (--world-to-camera), or write the standard header attribute worldToCamera",
     "lens": "give the full horizontal angle, the focus distance and the aperture's diameter, or "
     "write deepshade:fov, deepshade:focus and deepshade:aperture",
 }
@@ -210,6 +210,19 @@ def unmet(target: str, have: Collection[str], met: Collection[str]) -> list[Requ
     if plan(target, have, _REQUIREMENTS) is None:
         return []
     return [r for r in missing if plan(target, have, _REQUIREMENTS.keys() - {r}) is None]
+
+
+def depth_suffices(targets: Iterable[str]) -> str:
+    """For which of `targets` a depth pass is enough, and what it needs beside; "" for none."""
+    found: dict[tuple[Requirement, ...], list[str]] = {}
+    for target in targets:
+        if steps := plan(target, {"depth"}, _REQUIREMENTS):
+            needs = tuple(dict.fromkeys(step.requires for step in steps if step.requires))
+            found.setdefault(needs, []).append(target)
+    return "; ".join(
+        f"for {' and '.join(names)} a depth pass (Z) and {requirement_text(needs)} suffice"
+        for needs, names in found.items()
+    )
 
 
 def requirements(
