@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
 from importlib.resources import files
@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request, Response
 from fastapi.responses import HTMLResponse, PlainTextResponse
+from fastapi_offline import FastAPIOffline
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
@@ -35,7 +36,7 @@ from deepshade_service.shading import Shader
 from deepshade_service.telemetry import MEDIA_TYPE as METRICS_TYPE
 from deepshade_service.telemetry import Telemetry, server_timing
 from deepshade_service.uploads import Uploads
-from deepshade_service.workers import Cancelled, Workers
+from deepshade_service.workers import Cancelled, Workers, unless
 
 
 class Service:
@@ -53,8 +54,14 @@ class Service:
             environment_limits(settings.limits),
             int(SHARE * settings.memory),
         )
+        self.stopping = asyncio.Event()  # what is shaded then is finished, and no more is loaded
         self.shader = Shader(
-            self.models, self.workers, self.memory, settings.limits, self.environments
+            self.models,
+            self.workers,
+            self.memory,
+            settings.limits,
+            self.environments,
+            self.stopping,
         )
         self.telemetry = Telemetry(
             queued=lambda: self.workers.taken, held=lambda: self.uploads.held
@@ -83,7 +90,7 @@ class Service:
         async with self.uploads.receive(request) as files:
             with self.workers.place():
                 work = self.shader.shade(files, asked, candidates)
-                shaded = await _unless_gone(request, work)
+                shaded = await unless(_gone(request), Cancelled(), work)
         for made in () if asked.explain else shaded.made:
             shared = {name: ms / len(shaded.made) for name, ms in shaded.milliseconds.items()}
             nonfinite = int(made.facts["nonfinite_pixels"])
@@ -106,7 +113,8 @@ class Service:
 def create_app(settings: Settings | None = None) -> FastAPI:
     """The ASGI application for these settings."""
     service = Service(settings or Settings())
-    app = FastAPI(
+    app = FastAPIOffline(  # FastAPI, but /docs needs no internet
+        redoc_url=None,
         title="deepshade",
         version=version("deepshade"),
         summary="Neural screen-space shading: a G-buffer in, shaded appearance out.",
@@ -185,22 +193,6 @@ def _release(engines: list[Engine]) -> None:
     for engine in engines:
         engine.shrink()
     trim()
-
-
-async def _unless_gone(request: Request, work: Awaitable[Shaded]) -> Shaded:
-    """The work's result; if the client disconnects first the work is cancelled."""
-    job = asyncio.ensure_future(work)
-    gone = asyncio.ensure_future(_gone(request))
-    try:
-        await asyncio.wait({job, gone}, return_when=asyncio.FIRST_COMPLETED)
-        if not job.done():
-            raise Cancelled
-        return job.result()
-    finally:
-        for task in (job, gone):
-            task.cancel()
-            with suppress(asyncio.CancelledError, Exception):
-                await task
 
 
 async def _gone(request: Request) -> None:

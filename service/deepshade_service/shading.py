@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import threading
 from collections.abc import Iterator, Sequence
@@ -33,7 +34,7 @@ from deepshade_service.selection import Candidate, Selection, select
 from deepshade_service.telemetry import Stopwatch
 from deepshade_service.tiles import plan_tiles
 from deepshade_service.uploads import Upload
-from deepshade_service.workers import Cancelled, Workers
+from deepshade_service.workers import Cancelled, Workers, unless
 
 Float = NDArray[np.float32]
 
@@ -68,6 +69,7 @@ class Shader:
     memory: MemoryBudget
     limits: exr.Limits
     environments: Environments
+    stopping: asyncio.Event
 
     async def shade(
         self, files: list[Upload], asked: ShadeParameters, effects: list[list[Candidate]]
@@ -106,7 +108,7 @@ class Shader:
             return Shaded(content, media_type, made, watch.milliseconds)
 
         headers = await self.workers.run(read)
-        jobs = await self._jobs(headers, asked, effects)
+        jobs = await unless(self.stopping.wait(), _stopping(), self._jobs(headers, asked, effects))
         held = max(job.need.total for job in jobs)
         async with self.memory.hold(held):
             return await self.workers.run(_giving_back(jobs, held)(work))
@@ -244,6 +246,16 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
             fix="report it with the picture; another ?radius= or ?bundle= may work",
         )
     return shade
+
+
+def _stopping() -> Problem:
+    return Problem(
+        503,
+        "stopping",
+        "the service stops, and what this request needs was still being loaded",
+        fix="try again when it runs again",
+        headers={"Retry-After": "2"},
+    )
 
 
 @contextmanager

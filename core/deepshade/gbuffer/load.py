@@ -35,7 +35,8 @@ class GBuffer:
     `decoded` all that were read for that, as (file, channel), and `derived` how the others were
     computed. The windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes
     came from, `part_header` its own attributes, `entries` those of the shot; `header` holds those
-    of all parts and files, the first of each name. `up` is the world's up axis, as its renderer has it.
+    of all parts and files, the first of each name. `up` is the world's up axis, as its renderer
+    has it.
     """
 
     attributes: dict[str, NDArray[np.float32]]
