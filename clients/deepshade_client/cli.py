@@ -43,7 +43,9 @@ def shade(
         str | None,
         typer.Option("--out", "-o", help="A file, folder, or pattern with {name} and {effect}."),
     ] = None,
-    radius: Annotated[float | None, typer.Option(help="Effect radius, scene units.")] = None,
+    radius: Annotated[
+        str | None, typer.Option(help="Effect radius: scene units, or a share of the depth as 15%.")
+    ] = None,
     focus: Annotated[float | None, typer.Option(help="Distance in focus, scene units.")] = None,
     aperture: Annotated[float | None, typer.Option(help="Lens diameter, scene units.")] = None,
     shutter: Annotated[float | None, typer.Option(help="Open for so many frames.")] = None,
@@ -55,6 +57,10 @@ def shade(
     ] = None,
     up: Annotated[Literal["y", "z"] | None, typer.Option(help="The world's up axis.")] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    world_to_camera: Annotated[
+        str | None,
+        typer.Option(help="The camera's matrix: 16 numbers, row by row, for column vectors."),
+    ] = None,
     map_: Annotated[
         list[str] | None,
         typer.Option("--map", metavar="ATTR=CHANNEL", help="Where an attribute is; repeatable."),
@@ -111,6 +117,7 @@ def shade(
         rotate=rotate,
         up=up,
         fov=fov,
+        world_to_camera=world_to_camera,
         profile=profile,
         mapping=parse_mapping(map_ or []),
         bundle=bundle,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -121,7 +122,18 @@ def _line(result: Result) -> str:
     broken = {n for name, n in facts.items() if name.endswith("nonfinite_pixels")} - {"0"}
     if broken:
         parts.append(f"[yellow]{', '.join(sorted(broken))} non-finite pixels[/yellow]")
+    warnings = {value: None for name, value in facts.items() if name.endswith("warnings")}
+    parts += [f"\n    [yellow]{escape(as_options(text))}[/yellow]" for text in warnings]
     return "  ·  ".join(parts)
+
+
+def as_options(text: str) -> str:
+    """The service's text with "--fov 50" for "?fov=50"."""
+
+    def option(parameter: re.Match[str]) -> str:
+        return f"--{parameter[1].replace('_', '-')}{' ' if parameter[2] else ''}"
+
+    return re.sub(r"\?([a-z_]+)=(?=([\w<.])?)", option, text)
 
 
 def _print_error(console: Console, result: Result) -> None:
@@ -130,7 +142,7 @@ def _print_error(console: Console, result: Result) -> None:
         f"[red]✗[/red] {source}: {escape(str(result.error))}", highlight=False, soft_wrap=True
     )
     if fix := getattr(result.error, "fix", ""):
-        console.print(f"    {escape(fix)}", highlight=False, soft_wrap=True)
+        console.print(f"    {escape(as_options(fix))}", highlight=False, soft_wrap=True)
 
 
 def _entry(task: Task, result: Result | None) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def decode(
             for name in error.missing
         }
         raise MissingAttributeError(
-            error.missing, error.found, error.near, why=users, instead=error.instead
+            error.missing, error.found, error.near, why=users, enough=error.enough
         ) from None
 
 

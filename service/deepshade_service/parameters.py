@@ -17,6 +17,7 @@ from pydantic import (
     field_validator,
 )
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
 
 from deepshade.camera import parse_matrix
 from deepshade.effects import EFFECTS, SETTINGS, Effect
@@ -183,7 +184,8 @@ class ShadeParameters(BaseModel):
             if text is not None:
                 parse_matrix(text)
         except CameraError as error:
-            raise ValueError(f"{error}; {error.fix}" if error.fix else str(error)) from None
+            why = "; ".join(filter(None, (str(error), error.fix)))
+            raise PydanticCustomError("matrix", "{why}", {"why": why}) from None
         return text
 
     @property

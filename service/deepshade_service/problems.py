@@ -143,15 +143,13 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
         )
 
 
-_BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
-
-
 def _said(error: Mapping[str, Any]) -> str:
-    """What is wrong, with numbers that people can read."""
-    for bound, words in _BOUNDS.items():
-        if bound in (context := error.get("ctx", {})):
-            return f"it must be {words} {context[bound]:g}"
-    return str(error["msg"]).removeprefix("Value error, ")
+    """What is wrong, where a bound is missed in as few digits as say it."""
+    context = error.get("ctx", {})
+    for bound, word in (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below")):
+        if isinstance(context.get(bound), int | float):
+            return f"must be {word} {context[bound]:g}, not {str(error.get('input'))[:40]}"
+    return str(error["msg"])
 
 
 def _fix(error: Mapping[str, Any], parameters: Collection[str]) -> str:

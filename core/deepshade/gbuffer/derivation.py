@@ -7,7 +7,7 @@ Adding a derivation is adding a row. Everything is camera space unless it says w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -212,17 +212,14 @@ def unmet(target: str, have: Collection[str], met: Collection[str]) -> list[Requ
     return [r for r in missing if plan(target, have, _REQUIREMENTS.keys() - {r}) is None]
 
 
-def depth_suffices(targets: Iterable[str]) -> str:
-    """For which of `targets` a depth pass is enough, and what it needs beside; "" for none."""
-    found: dict[tuple[Requirement, ...], list[str]] = {}
-    for target in targets:
-        if steps := plan(target, {"depth"}, _REQUIREMENTS):
-            needs = tuple(dict.fromkeys(step.requires for step in steps if step.requires))
-            found.setdefault(needs, []).append(target)
-    return "; ".join(
-        f"for {' and '.join(names)} a depth pass (Z) and {requirement_text(needs)} suffice"
-        for needs, names in found.items()
-    )
+def enough(missing: Collection[str]) -> str:
+    """In words, what common pass all of them could be derived from; "" if there is none."""
+    cameras: tuple[tuple[Requirement, ...], ...] = (("fov",), ("fov", "matrix"))
+    for given in (("depth",), ("depth", "normal")):
+        for met in cameras:
+            if all(plan(name, given, met) is not None for name in missing):
+                return f"{' and '.join(given)} with {requirement_text(met)} would do"
+    return ""
 
 
 def requirements(
