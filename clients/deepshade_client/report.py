@@ -123,8 +123,8 @@ def _line(result: Result) -> str:
     if broken:
         parts.append(f"[yellow]{', '.join(sorted(broken))} non-finite pixels[/yellow]")
     warnings = {value: None for name, value in facts.items() if name.endswith("warnings")}
-    parts += [f"\n    [yellow]{escape(as_options(text))}[/yellow]" for text in warnings]
-    return "  ·  ".join(parts)
+    lines = [f"\n    [yellow]{escape(as_options(text))}[/yellow]" for text in warnings]
+    return "".join(("  ·  ".join(parts), *lines))
 
 
 def as_options(text: str) -> str:

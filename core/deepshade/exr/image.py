@@ -154,14 +154,21 @@ def write(
             name: floats.to_half(plane) if name in halves else np.ascontiguousarray(plane, "f4")
             for name, plane in planes.items()
         }
-        settings = _for_library(header) | {
+        entries = {name: value for name, value in header.items() if isinstance(value, Entry)}
+        settings = {name: value for name, value in header.items() if name not in entries} | {
             "compression": COMPRESSIONS[compression],
             "type": OpenEXR.scanlineimage,
             "dataWindow": _corners(data),
             "displayWindow": _corners(display),
         }
         with OpenEXR.File(settings, stored, num_threads=_library_threads()) as file:
-            file.write(stream)
+            if not entries:
+                file.write(stream)
+                return
+            body = io.BytesIO()
+            file.write(body)
+        for piece in exrencode.with_entries(body.getbuffer(), entries):
+            stream.write(piece)
 
     if isinstance(target, (str, os.PathLike)):
         with replacing(Path(target)) as temporary, temporary.open("wb") as stream:
@@ -208,18 +215,6 @@ def _attribute(key: str, value: Any) -> Any:
             whole = array.dtype.kind in "iu" and array.ndim == 1
             return np.ascontiguousarray(array, np.int32 if whole else np.float32)
     raise ValueError(f"the header attribute '{key}' can't hold {value!r:.60}")
-
-
-def _for_library(header: dict[str, Any]) -> dict[str, Any]:
-    """Attributes as the library takes them: entries as it reads them from a file of a pixel."""
-    entries = {name: value for name, value in header.items() if isinstance(value, Entry)}
-    if not entries:
-        return header
-    pixel, window = {"Y": np.zeros((1, 1), np.float32)}, (0, 0, 0, 0)
-    body = b"".join(exrencode.encode(pixel, (), window, window, "zips", entries))
-    with OpenEXR.File(io.BytesIO(body), header_only=True) as file:
-        read = file.header()
-        return header | {name: read[name] for name in entries}
 
 
 def _checked_window(name: str, window: Window) -> Window:
