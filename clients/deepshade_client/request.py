@@ -67,6 +67,9 @@ class Options:
     format: Literal["exr", "png"] | None = None
     compression: str | None = None
     half: bool | None = None
+    append: bool | None = None
+    layer: str | None = None
+    multiply: bool | None = None
 
     def query(self) -> list[tuple[str, str]]:
         """As the parameters of the request."""

@@ -70,7 +70,9 @@ def decode(
             name: f"for {', '.join(effect for effect, names in needs.items() if name in names)}"
             for name in error.missing
         }
-        raise MissingAttributeError(error.missing, error.found, error.near, why=users) from None
+        raise MissingAttributeError(
+            error.missing, error.found, error.near, why=users, enough=error.enough
+        ) from None
 
 
 def _shuttered(gbuffer: GBuffer, effect: Effect, asked: ShadeParameters) -> GBuffer:

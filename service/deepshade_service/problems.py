@@ -106,7 +106,7 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
         errors = [
             {
                 "where": ".".join(str(step) for step in entry["loc"]),
-                "problem": entry["msg"],
+                "problem": _said(entry),
                 "got": str(entry.get("input"))[:200],
             }
             for entry in error.errors()
@@ -126,6 +126,15 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
                 fix="report it with the request that caused it",
             )
         )
+
+
+def _said(error: Mapping[str, Any]) -> str:
+    """What is wrong, where a bound is missed in as few digits as say it."""
+    context = error.get("ctx", {})
+    for bound, word in (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below")):
+        if isinstance(context.get(bound), int | float):
+            return f"must be {word} {context[bound]:g}, not {str(error.get('input'))[:40]}"
+    return str(error["msg"])
 
 
 def _fix(error: Mapping[str, Any], parameters: Collection[str]) -> str:

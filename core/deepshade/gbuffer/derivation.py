@@ -212,6 +212,16 @@ def unmet(target: str, have: Collection[str], met: Collection[str]) -> list[Requ
     return [r for r in missing if plan(target, have, _REQUIREMENTS.keys() - {r}) is None]
 
 
+def enough(missing: Collection[str]) -> str:
+    """In words, what common pass all of them could be derived from; "" if there is none."""
+    cameras: tuple[tuple[Requirement, ...], ...] = (("fov",), ("fov", "matrix"))
+    for given in (("depth",), ("depth", "normal")):
+        for met in cameras:
+            if all(plan(name, given, met) is not None for name in missing):
+                return f"{' and '.join(given)} with {requirement_text(met)} would do"
+    return ""
+
+
 def requirements(
     camera: Camera | None, matrix: NDArray[np.float64] | None, header: Mapping[str, Any]
 ) -> set[Requirement]:

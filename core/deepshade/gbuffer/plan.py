@@ -94,7 +94,7 @@ class Plan:
         if missing:
             found = [name for layer in self.layers for name in layer.channels]
             near = near_misses(self.layers, missing)
-            raise MissingAttributeError(missing, found, near)
+            raise MissingAttributeError(missing, found, near, enough=derivation.enough(missing))
         wanted = list(dict.fromkeys(need for name in lacking for need in unmet[name]))
         raise CameraError(
             f"{', '.join(map(repr, lacking))} could be derived from what is there, but that needs "
