@@ -31,6 +31,16 @@ EXIT_CODES = (
 AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output on stdout.")]
 
 
+def _checked_radius(text: str | None) -> str | None:
+    try:
+        float((text or "0").removesuffix("%"))
+    except ValueError:
+        raise typer.BadParameter(
+            f"'{text}' is no radius; write scene units, or a share of the depth, as 10%"
+        ) from None
+    return text
+
+
 @app.command(epilog=EXIT_CODES)
 def shade(
     effect: Annotated[
@@ -51,7 +61,12 @@ def shade(
             "%04d for the frame.",
         ),
     ] = None,
-    radius: Annotated[float | None, typer.Option(help="Effect radius, scene units.")] = None,
+    radius: Annotated[
+        str | None,
+        typer.Option(
+            help="Effect radius: scene units, or 10% of the median depth.", callback=_checked_radius
+        ),
+    ] = None,
     focus: Annotated[float | None, typer.Option(help="Distance in focus, scene units.")] = None,
     aperture: Annotated[float | None, typer.Option(help="Lens diameter, scene units.")] = None,
     shutter: Annotated[float | None, typer.Option(help="Open for so many frames.")] = None,
@@ -63,6 +78,10 @@ def shade(
     ] = None,
     up: Annotated[Literal["y", "z"] | None, typer.Option(help="The world's up axis.")] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    world_to_camera: Annotated[
+        str | None,
+        typer.Option(help="The camera's matrix, 16 numbers row by row, for column vectors."),
+    ] = None,
     map_: Annotated[
         list[str] | None,
         typer.Option("--map", metavar="ATTR=CHANNEL", help="Where an attribute is; repeatable."),
@@ -138,6 +157,7 @@ def shade(
         rotate=rotate,
         up=up,
         fov=fov,
+        world_to_camera=world_to_camera,
         profile=profile,
         mapping=parse_mapping(map_ or []),
         bundle=bundle,

@@ -58,9 +58,7 @@ class Batch:
         if type(error) in self.told:
             return
         self.told.add(type(error))
-        lines = f"[yellow]…[/yellow] {escape(str(error))}; trying again", escape(error.fix)
-        for line in filter(None, lines):
-            self.bar.console.print(line, highlight=False, soft_wrap=True)
+        _print_failure(self.bar.console, "[yellow]…[/yellow]", f"{error}; trying again", error)
 
     def counts(self) -> dict[str, int]:
         """How many were saved, failed, were skipped, and weren't tried."""
@@ -168,20 +166,27 @@ def _line(result: Result) -> str:
     derived = {value: None for name, value in facts.items() if name.endswith("derived") and value}
     if derived:
         parts.append(f"derived {escape('; '.join(derived))}")
+    if left := facts.get("left_out"):
+        parts.append(f"[yellow]not appended: {escape(left)}[/yellow]")
     if multiplied := facts.get("multiplied"):
         parts.append(f"multiplied onto {escape(multiplied)}")
     broken = {n for name, n in facts.items() if name.endswith("nonfinite_pixels")} - {"0"}
     if broken:
         parts.append(f"[yellow]{', '.join(sorted(broken))} non-finite pixels[/yellow]")
+    warnings = {value: None for name, value in facts.items() if name.endswith("warnings")}
+    parts += [f"[yellow]{escape(value)}[/yellow]" for value in warnings if value]
     return "  ·  ".join(parts)
 
 
 def _print_error(console: Console, result: Result) -> None:
-    source = escape(str(result.task.sources[0]))
-    console.print(
-        f"[red]✗[/red] {source}: {escape(str(result.error))}", highlight=False, soft_wrap=True
-    )
-    if fix := getattr(result.error, "fix", ""):
+    assert result.error is not None
+    text = f"{result.task.sources[0]}: {result.error}"
+    _print_failure(console, "[red]✗[/red]", text, result.error)
+
+
+def _print_failure(console: Console, mark: str, text: str, error: Exception) -> None:
+    console.print(f"{mark} {escape(text)}", highlight=False, soft_wrap=True)
+    if fix := getattr(error, "fix", ""):
         console.print(f"    {escape(fix)}", highlight=False, soft_wrap=True)
 
 

@@ -38,9 +38,11 @@ Effects = str | Sequence[str]  # "ao", "ao,gi" or ["ao", "gi"]
 class Options:
     """What a shading request may ask for; None leaves it to the service.
 
-    `radius`, `focus` and `aperture` are in scene units, `shutter` in frames, `fov` is the full
-    horizontal angle in degrees, `mapping` says which layer or comma-separated channels hold an
-    attribute, `half` asks for 16-bit pixels. `environment` names the map that lights the scene,
+    `radius`, `focus` and `aperture` are in scene units (the radius also as "10%" of the picture's
+    median depth), `shutter` in frames, `fov` is the full horizontal angle in degrees,
+    `world_to_camera` the camera's matrix for column vectors as 16 numbers row by row, `mapping`
+    says which layer or comma-separated channels hold an attribute, `half` asks for 16-bit pixels.
+    `environment` names the map that lights the scene,
     `rotate` turns it, in degrees, and `up` is the world's up axis.
 
     What shades: `quality` ("fast", "balanced", "best") or `bundle` by name; `max_error` (DSSIM)
@@ -48,7 +50,7 @@ class Options:
     network; `engine` ("openvino") and `precision` ("bf16") pin how it runs.
     """
 
-    radius: float | None = None
+    radius: float | str | None = None
     focus: float | None = None
     aperture: float | None = None
     shutter: float | None = None
@@ -56,6 +58,7 @@ class Options:
     rotate: float | None = None
     up: Literal["y", "z"] | None = None
     fov: float | None = None
+    world_to_camera: str | None = None
     profile: str | None = None
     mapping: Mapping[str, str] | None = None
     bundle: str | None = None
