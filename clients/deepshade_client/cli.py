@@ -31,16 +31,6 @@ EXIT_CODES = (
 AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output on stdout.")]
 
 
-def _checked_radius(text: str | None) -> str | None:
-    try:
-        float((text or "0").removesuffix("%"))
-    except ValueError:
-        raise typer.BadParameter(
-            f"'{text}' is no radius; write scene units, or a share of the depth, as 10%"
-        ) from None
-    return text
-
-
 @app.command(epilog=EXIT_CODES)
 def shade(
     effect: Annotated[
@@ -62,10 +52,7 @@ def shade(
         ),
     ] = None,
     radius: Annotated[
-        str | None,
-        typer.Option(
-            help="Effect radius: scene units, or 10% of the median depth.", callback=_checked_radius
-        ),
+        str | None, typer.Option(help="Effect radius: scene units, or a share of the depth as 15%.")
     ] = None,
     focus: Annotated[float | None, typer.Option(help="Distance in focus, scene units.")] = None,
     aperture: Annotated[float | None, typer.Option(help="Lens diameter, scene units.")] = None,
@@ -80,7 +67,7 @@ def shade(
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
     world_to_camera: Annotated[
         str | None,
-        typer.Option(help="The camera's matrix, 16 numbers row by row, for column vectors."),
+        typer.Option(help="The camera's matrix: 16 numbers, row by row, for column vectors."),
     ] = None,
     map_: Annotated[
         list[str] | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -174,8 +175,17 @@ def _line(result: Result) -> str:
     if broken:
         parts.append(f"[yellow]{', '.join(sorted(broken))} non-finite pixels[/yellow]")
     warnings = {value: None for name, value in facts.items() if name.endswith("warnings")}
-    parts += [f"[yellow]{escape(value)}[/yellow]" for value in warnings if value]
-    return "  ·  ".join(parts)
+    lines = [f"\n    [yellow]{escape(as_options(text))}[/yellow]" for text in warnings]
+    return "".join(("  ·  ".join(parts), *lines))
+
+
+def as_options(text: str) -> str:
+    """The service's text with "--fov 50" for "?fov=50"."""
+
+    def option(parameter: re.Match[str]) -> str:
+        return f"--{parameter[1].replace('_', '-')}{' ' if parameter[2] else ''}"
+
+    return re.sub(r"\?([a-z_]+)=(?=([\w<.])?)", option, text)
 
 
 def _print_error(console: Console, result: Result) -> None:
@@ -187,7 +197,7 @@ def _print_error(console: Console, result: Result) -> None:
 def _print_failure(console: Console, mark: str, text: str, error: Exception) -> None:
     console.print(f"{mark} {escape(text)}", highlight=False, soft_wrap=True)
     if fix := getattr(error, "fix", ""):
-        console.print(f"    {escape(fix)}", highlight=False, soft_wrap=True)
+        console.print(f"    {escape(as_options(fix))}", highlight=False, soft_wrap=True)
 
 
 def _entry(task: Task, result: Result | None) -> dict[str, Any]:

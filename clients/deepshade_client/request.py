@@ -12,6 +12,8 @@ from typing import Any, Literal, TypeVar
 from urllib.parse import quote
 
 import httpx
+import numpy as np
+from numpy.typing import ArrayLike
 
 from deepshade_client.answer import Answer, Saved, facts, timing
 from deepshade_client.exceptions import (
@@ -38,12 +40,15 @@ Effects = str | Sequence[str]  # "ao", "ao,gi" or ["ao", "gi"]
 class Options:
     """What a shading request may ask for; None leaves it to the service.
 
-    `radius`, `focus` and `aperture` are in scene units (the radius also as "10%" of the picture's
-    median depth), `shutter` in frames, `fov` is the full horizontal angle in degrees,
-    `world_to_camera` the camera's matrix for column vectors as 16 numbers row by row, `mapping`
-    says which layer or comma-separated channels hold an attribute, `half` asks for 16-bit pixels.
-    `environment` names the map that lights the scene,
+    `radius`, `focus` and `aperture` are in scene units, `shutter` in frames, `fov` is the full
+    horizontal angle in degrees. `radius` may be a share of the median depth, "15%", which it is
+    without one. `world_to_camera` is the camera's matrix (4, 4), for column vectors, or its numbers
+    row by row as text. `mapping` says which layer or comma-separated channels hold an
+    attribute, `half` asks for 16-bit pixels. `environment` names the map that lights the scene,
     `rotate` turns it, in degrees, and `up` is the world's up axis.
+
+    What the answer holds: with `append` the picture's own channels too, and the answer as a layer;
+    `layer` names that ("AO"); with `multiply` the picture's beauty times the answer.
 
     What shades: `quality` ("fast", "balanced", "best") or `bundle` by name; `max_error` (DSSIM)
     asks for the fastest within an error, `budget_ms` for the most accurate within a time of the
@@ -58,7 +63,7 @@ class Options:
     rotate: float | None = None
     up: Literal["y", "z"] | None = None
     fov: float | None = None
-    world_to_camera: str | None = None
+    world_to_camera: ArrayLike | str | None = None
     profile: str | None = None
     mapping: Mapping[str, str] | None = None
     bundle: str | None = None
@@ -76,7 +81,10 @@ class Options:
 
     def query(self) -> list[tuple[str, str]]:
         """As the parameters of the request."""
-        plain = asdict(replace(self, mapping=None))
+        matrix = self.world_to_camera
+        if matrix is not None and not isinstance(matrix, str):
+            matrix = ",".join(f"{number:.17g}" for number in np.asarray(matrix, float).flat)
+        plain = asdict(replace(self, mapping=None, world_to_camera=matrix))
         mapped = [("map", f"{name}={where}") for name, where in (self.mapping or {}).items()]
         return [(name, _text(value)) for name, value in plain.items() if value is not None] + mapped
 

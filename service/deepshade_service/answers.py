@@ -67,7 +67,7 @@ class Shaded:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where an answer lies: EXR attributes of the camera, and the windows."""
+    """Where an answer lies: EXR attributes of the shot and the camera, and the windows."""
 
     attributes: Mapping[str, Any]
     data_window: exr.Window
@@ -76,7 +76,8 @@ class Place:
     @classmethod
     def of(cls, gbuffer: GBuffer) -> Place:
         """Where the G-buffer lies."""
-        return cls(gbuffer.placement(), gbuffer.data_window, gbuffer.display_window)
+        attributes = gbuffer.entries | gbuffer.placement()
+        return cls(attributes, gbuffer.data_window, gbuffer.display_window)
 
 
 def encode(

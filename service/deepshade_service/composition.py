@@ -73,7 +73,7 @@ def check(asked: ShadeParameters, effects: Sequence[Effect]) -> None:
         name = "layer" if asked.layer else "multiply"
         raise _wrong(
             f"?{name}= is for one effect, and several were asked for",
-            "ask for one; several are layers of their own names, with ?append=1 too",
+            f"leave out ?{name}=; several effects are layers of their own names",
         )
     if asked.multiply and effect.is_light:
         raise _wrong(

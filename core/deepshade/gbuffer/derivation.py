@@ -23,13 +23,13 @@ Requirement = Literal["fov", "matrix", "lens"]
 _PIECE = 2**13  # pixels transformed at a time
 
 _REQUIREMENTS: dict[Requirement, str] = {
-    "fov": "the field of view",
-    "matrix": "the camera's matrix (worldToCamera)",
+    "fov": "the field of view (--fov)",
+    "matrix": "the camera's matrix (--world-to-camera)",
     "lens": "the field of view and the lens (deepshade:focus and deepshade:aperture)",
 }
 REQUIREMENT_FIXES: dict[Requirement, str] = {
     "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov",
-    "matrix": "write the standard header attribute worldToCamera (M44f)",
+    "matrix": "give it (--world-to-camera), or write the standard header attribute worldToCamera",
     "lens": "give the full horizontal angle, the focus distance and the aperture's diameter, or "
     "write deepshade:fov, deepshade:focus and deepshade:aperture",
 }
