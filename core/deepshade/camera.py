@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -190,6 +191,38 @@ def matrix_from_header(attributes: Mapping[str, Any]) -> NDArray[np.float64] | N
         matrix = np.asarray(value, np.float64).reshape(4, 4).T
     except (TypeError, ValueError):
         raise CameraError("the header's worldToCamera is no 4 x 4 matrix") from None
+    return _checked_matrix(matrix)
+
+
+def parse_matrix(text: str) -> NDArray[np.float64]:
+    """worldToCamera (4, 4), for column vectors, of 16 numbers row by row, or of the first 12.
+
+    Between the numbers may stand blanks, commas, semicolons and brackets, as numpy, JSON and
+    Blender print a matrix. Raises CameraError for anything else.
+    """
+    words = re.split(r"[\s,;()\[\]]+", text.strip(" \t\r\n,;()[]"))
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 12:
+        numbers += [0, 0, 0, 1]
+    if len(numbers) != 16:
+        few = len(numbers) == 9
+        raise CameraError(
+            "a rotation alone doesn't say where the camera is"
+            if few
+            else f"worldToCamera must be 16 numbers, or the first 12, not '{text:.60}'",
+            fix="add the translation to each row"
+            if few
+            else "write its rows one after the other, with commas between the numbers",
+        )
+    matrix = np.reshape(numbers, (4, 4))
+    if not matrix[:3, 3].any() and matrix[3, :3].any() and matrix[3, 3] == 1:
+        raise CameraError(
+            "worldToCamera is transposed: its translation stands in the last row",
+            fix="write it as it multiplies column vectors, the translation in the last column",
+        )
     return _checked_matrix(matrix)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 from pathlib import Path
@@ -146,12 +147,14 @@ def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
     import uvicorn
 
     from deepshade_service.app import create_app
+    from deepshade_service.server import Server
 
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     print(f"deepshade is serving at http://{shown}:{port} (Ctrl-C stops it)", flush=True)
+    app = create_app(settings)
     config = uvicorn.Config(
-        create_app(settings),
+        app,
         log_config=_logging(log_level),
         # Without it uvicorn waits for open sockets for ever.
         timeout_graceful_shutdown=max(1, round(settings.grace)),
@@ -161,7 +164,16 @@ def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
     # tidy, so they shall neither print a traceback nor turn a clean end into a failure.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)
-    uvicorn.Server(config).run(sockets=[listener])
+    Server(config, app.state.service).run(sockets=[listener])
+
+
+_POLLS = ("/healthz", "/readyz", "/metrics")
+
+
+def _no_poll(record: logging.LogRecord) -> bool:
+    """Whether a line of uvicorn's access log is about anything else than a health poll."""
+    _, _, path, *_ = record.args if isinstance(record.args, tuple) else ("", "", "")
+    return str(path).partition("?")[0] not in _POLLS
 
 
 def _logging(level: str) -> dict[str, Any]:
@@ -170,8 +182,12 @@ def _logging(level: str) -> dict[str, Any]:
 
     from uvicorn.config import LOGGING_CONFIG
 
-    logging = deepcopy(LOGGING_CONFIG)
+    config = deepcopy(LOGGING_CONFIG)
+    for formatter in config["formatters"].values():
+        formatter["fmt"] = f"%(asctime)s {formatter['fmt']}"
+    config["filters"] = {"polls": {"()": lambda: _no_poll}}
+    config["handlers"]["access"]["filters"] = ["polls"]
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "deepshade"):
-        logging["loggers"].setdefault(name, {"handlers": ["default"], "propagate": False})
-        logging["loggers"][name]["level"] = level.upper()
-    return logging
+        config["loggers"].setdefault(name, {"handlers": ["default"], "propagate": False})
+        config["loggers"][name]["level"] = level.upper()
+    return config

@@ -20,14 +20,17 @@ from deepshade_service.uploads import Upload
 def read_headers(
     files: Sequence[Upload], asked: ShadeParameters, limits: exr.Limits
 ) -> list[exr.Header]:
-    """The files' checked headers, in which the lens is the one asked for.
+    """The files' checked headers, in which lens and camera are those asked for.
 
     Raises what `exr.read_header` raises.
     """
     headers = [exr.read_header(file.data, limits) for file in files]
     lens = {SETTINGS[name].header: getattr(asked, name) for name in LENS}
+    said = {key: value for key, value in lens.items() if value is not None}
+    if (matrix := asked.matrix) is not None:
+        said["worldToCamera"] = matrix.T.astype(np.float32)  # Imath multiplies row vectors
     for part in (part for header in headers for part in header.parts):
-        part.attributes.update({key: value for key, value in lens.items() if value is not None})
+        part.attributes.update(said)
     return headers
 
 
@@ -70,7 +73,9 @@ def decode(
             name: f"for {', '.join(effect for effect, names in needs.items() if name in names)}"
             for name in error.missing
         }
-        raise MissingAttributeError(error.missing, error.found, error.near, why=users) from None
+        raise MissingAttributeError(
+            error.missing, error.found, error.near, why=users, enough=error.enough
+        ) from None
 
 
 def _shuttered(gbuffer: GBuffer, effect: Effect, asked: ShadeParameters) -> GBuffer:

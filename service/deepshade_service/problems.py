@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Collection, Mapping
 from http import HTTPStatus
 from typing import Any
@@ -50,8 +51,11 @@ class Problem(Exception):
         self.more = {"fix": fix, **more} if fix else more
 
 
-def from_error(error: DeepshadeError) -> Problem:
-    """The problem that an error of the core package is, with the facts that it carries."""
+def from_error(error: DeepshadeError, parameters: Collection[str]) -> Problem:
+    """The problem that an error of the core package is, with the facts that it carries.
+
+    Options of commands, which core names, are those of `parameters` here.
+    """
     status, kind = kind_of(error)
     fix = error.fix
     if isinstance(error, EngineError):  # what can't run here at all is refused before
@@ -59,7 +63,18 @@ def from_error(error: DeepshadeError) -> Problem:
     if isinstance(error, LimitError) and error.limit in _OPTIONS:
         option = _OPTIONS[error.limit]
         fix = f"send a smaller picture, or start the service with a higher {option}"
-    return Problem(status, kind, str(error), fix=fix, **facts_of(error))
+    detail = _as_query(str(error), parameters)
+    return Problem(status, kind, detail, fix=_as_query(fix, parameters), **facts_of(error))
+
+
+def _as_query(text: str, parameters: Collection[str]) -> str:
+    """The text with "?fov=50" for "--fov 50"."""
+
+    def query(option: re.Match[str]) -> str:
+        name = option[1].replace("-", "_")
+        return f"?{name}=" if name in parameters else option[0]
+
+    return re.sub(r"--([a-z][a-z-]*)(?: (?=[\w<]))?", query, text)
 
 
 def respond(problem: Problem) -> JSONResponse:
@@ -87,7 +102,7 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
 
     @app.exception_handler(DeepshadeError)
     async def _(request: Request, error: DeepshadeError) -> JSONResponse:
-        problem = from_error(error)
+        problem = from_error(error, parameters)
         if problem.status >= 500:
             log.error("%s: %s", request.url.path, error)
         return respond(problem)
@@ -106,7 +121,7 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
         errors = [
             {
                 "where": ".".join(str(step) for step in entry["loc"]),
-                "problem": entry["msg"],
+                "problem": _said(entry),
                 "got": str(entry.get("input"))[:200],
             }
             for entry in error.errors()
@@ -128,12 +143,26 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
         )
 
 
+def _said(error: Mapping[str, Any]) -> str:
+    """What is wrong, where a bound is missed in as few digits as say it."""
+    context = error.get("ctx", {})
+    for bound, word in (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below")):
+        if isinstance(context.get(bound), int | float):
+            return f"must be {word} {context[bound]:g}, not {str(error.get('input'))[:40]}"
+    return str(error["msg"])
+
+
 def _fix(error: Mapping[str, Any], parameters: Collection[str]) -> str:
     """The parameter that may have been meant, or the nearest value that it may have."""
     name = str(error["loc"][-1])
     if error["type"] == "extra_forbidden":
         close = nearest(name[:100], parameters)
         return f"did you mean ?{close}=?" if close else "/docs lists the parameters"
+    if error["type"] in ("literal_error", "enum"):
+        close = nearest(
+            str(error["input"])[:100], re.findall("'([^']+)'", error["ctx"]["expected"])
+        )
+        return f"did you mean ?{name}={close}?" if close else ""
     for bound in ("ge", "le"):
         if bound in (context := error.get("ctx", {})):
             return f"the nearest is ?{name}={context[bound]:g}"

@@ -36,7 +36,7 @@ def test_effects(client):
     assert bundle["times"] == []
     (radius,) = ao["settings"]
     assert (radius["name"], radius["unit"]) == ("radius", "scene units")
-    assert (radius["header"], radius["default"]) == ("deepshade:radius", 0.5)  # the bundle's own
+    assert (radius["header"], radius["default"]) == ("deepshade:radius", "15% of the median depth")
     by_name = {effect["name"]: effect for effect in effects}
     settings = {setting["name"]: setting for setting in by_name["full"]["settings"]}
     assert list(settings) == ["radius", "focus", "aperture", "environment", "rotate", "up"]
@@ -80,6 +80,7 @@ def test_schema_and_pages(client):
         "environment",
         "rotate",
         "up",
+        "world_to_camera",
         "fov",
         "profile",
         "map",

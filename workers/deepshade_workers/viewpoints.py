@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from deepshade.camera import Camera
+from deepshade.effects import SETTINGS
 from deepshade.errors import SceneError
 from deepshade_workers.drawing import dress
 from deepshade_workers.references import ao
@@ -21,7 +22,7 @@ MAX_TRIES = 400
 MAX_BACKGROUND = 0.6
 MAX_BACK_FACES = 0.05
 # Effect radius relative to the view's median depth: about 25 to 280 pixels of a 512-pixel frame.
-RADIUS_RANGE = (0.05, 0.5)
+RADIUS_RANGE = SETTINGS["radius"].learnt
 
 
 def sample_view(

@@ -16,6 +16,7 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera, placement_of
 from deepshade.errors import CameraError, ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
+from deepshade.exr.entries import Entry
 from deepshade.gbuffer import background, channels, derivation
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
 from deepshade.gbuffer.profiles import QUANTITIES
@@ -33,8 +34,9 @@ class GBuffer:
     background and doesn't count). `mapped` tells which channels each quantity came from,
     `decoded` all that were read for that, as (file, channel), and `derived` how the others were
     computed. The windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes
-    came from, `part_header` its own attributes; `header` holds those of all parts and files, the
-    first of each name. `up` is the world's up axis, as its renderer has it.
+    came from, `part_header` its own attributes, `entries` those of the shot; `header` holds those
+    of all parts and files, the first of each name. `up` is the world's up axis, as its renderer
+    has it.
     """
 
     attributes: dict[str, NDArray[np.float32]]
@@ -46,6 +48,7 @@ class GBuffer:
     derived: dict[str, str] = field(default_factory=dict)
     header: dict[str, Any] = field(default_factory=dict)
     part_header: dict[str, Any] = field(default_factory=dict)
+    entries: dict[str, Entry] = field(default_factory=dict)
     data_window: exr.Window = (0, 0, 0, 0)
     display_window: exr.Window = (0, 0, 0, 0)
     up: Literal["y", "z"] = "y"
@@ -59,9 +62,14 @@ class GBuffer:
         """EXR attributes that, beside the windows, put an answer exactly where its input lies.
 
         Pixel aspect, screen window and worldToCamera: the camera's, or without one (no field of
-        view is known) what the part's header says of them, as far as it is usable.
+        view is known) what the part's header says of them, as far as it is usable. The matrix is
+        the header's own, where it has one, whichever way its camera looks.
         """
-        return placement_of(self.part_header) | (self.camera.to_header() if self.camera else {})
+        said = placement_of(self.part_header)
+        camera = self.camera.to_header() if self.camera else {}
+        if "worldToCamera" in said:
+            camera.pop("worldToCamera", None)
+        return said | camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +177,7 @@ def _load(
             derived={name: job.plan.how(step) for name, step in job.steps.items()},
             header=job.plan.attributes,
             part_header=job.part.attributes,
+            entries=job.part.entries,
             data_window=job.part.data_window,
             display_window=job.part.display_window,
             up=job.plan.profile.up if job.plan.profile else "y",
