@@ -47,6 +47,9 @@ class Options:
     attribute, `half` asks for 16-bit pixels. `environment` names the map that lights the scene,
     `rotate` turns it, in degrees, and `up` is the world's up axis.
 
+    What the answer holds: with `append` the picture's own channels too, and the answer as a layer;
+    `layer` names that ("AO"); with `multiply` the picture's beauty times the answer.
+
     What shades: `quality` ("fast", "balanced", "best") or `bundle` by name; `max_error` (DSSIM)
     asks for the fastest within an error, `budget_ms` for the most accurate within a time of the
     network; `engine` ("openvino") and `precision` ("bf16") pin how it runs.
@@ -72,6 +75,9 @@ class Options:
     format: Literal["exr", "png"] | None = None
     compression: str | None = None
     half: bool | None = None
+    append: bool | None = None
+    layer: str | None = None
+    multiply: bool | None = None
 
     def query(self) -> list[tuple[str, str]]:
         """As the parameters of the request."""

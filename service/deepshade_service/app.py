@@ -22,8 +22,8 @@ from deepshade.engines import Engine
 from deepshade.errors import EngineError
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
+from deepshade_service import composition, problems
 from deepshade_service import environment_routes as routes
-from deepshade_service import problems
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
 from deepshade_service.environments import SHARE, Environments
@@ -84,6 +84,7 @@ class Service:
         effects = find_effects(names)
         candidates = [allowed(self.models, effect.name, asked) for effect in effects]
         asked.check(effects)
+        composition.check(asked, effects)
         if asked.environment is not None:
             self.environments.check(asked.environment)
         self.workers.check_place()  # before the body is received, to spare both sides the work

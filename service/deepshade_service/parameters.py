@@ -160,6 +160,25 @@ class ShadeParameters(BaseModel):
     ] = "exr"
     compression: Annotated[Compression, Field(description="Of the EXR.")] = Compression("zip")
     half: Annotated[bool, Field(description="16-bit pixels in the EXR, else 32-bit.")] = True
+    append: Annotated[
+        bool,
+        Field(description="The picture's own channels too, and the answer as a layer beside them."),
+    ] = False
+    layer: Annotated[
+        str | None,
+        Field(
+            max_length=100,
+            pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.:-]*$",
+            description="The name of the answer's layer, as `AO`; with `append` else the effect's.",
+        ),
+    ] = None
+    multiply: Annotated[
+        bool,
+        Field(
+            description="The picture's beauty times the answer, in place of the answer alone."
+            " `map=beauty=…` says where it is, else its name (`Combined`, `rgba`, …) or R G B."
+        ),
+    ] = False
 
     @field_validator("map")
     @classmethod

@@ -22,6 +22,7 @@ from deepshade.environments import Prepared
 from deepshade.gbuffer import GBuffer
 from deepshade.machine import trim
 from deepshade_service.answers import Made, Place, Shaded, encode, plan_of
+from deepshade_service.composition import Composition, bytes_of, compose
 from deepshade_service.decoding import decode, read_headers
 from deepshade_service.environments import DEFAULT, Environments
 from deepshade_service.memory import MemoryBudget, Need, need_of, size_of
@@ -89,22 +90,29 @@ class Shader:
             made: list[Made] = []
             bundles = [job.bundle for job in jobs]
             gbuffers = decode(files, headers, bundles, asked, self.limits)
+            composition: Composition | None = None
             for job in jobs:
                 if cancelled.is_set():
                     raise Cancelled
                 with watch.time("decode"):
                     gbuffer = next(gbuffers)
                 place = Place.of(gbuffer)
+                if composition is None:
+                    effects = [EFFECTS[bundle.effect] for bundle in bundles]
+                    composition = compose(files, headers, asked, effects, gbuffer)
                 shade, how = run(job, gbuffer, headers, asked, held, cancelled)
                 shades.append(shade)
-                made.append(how)
+                made.append(replace(how, facts=how.facts | composition.facts))
                 del gbuffer  # the next may be decoded anew
             if asked.explain:
                 content = json.dumps(plan_of(made), indent=2).encode()
                 return Shaded(content, "application/json", made, watch.milliseconds)
             gbuffers.close()  # what they share is no longer needed
+            assert composition is not None, "there is at least one effect"
+            with watch.time("decode"):
+                own = composition.read(files, headers)
             with watch.time("encode"):
-                content, media_type = encode(shades, made, place, asked)
+                content, media_type = encode(shades, made, place, asked, composition, own)
             return Shaded(content, media_type, made, watch.milliseconds)
 
         headers = await self.workers.run(read)
@@ -121,7 +129,8 @@ class Shader:
         jobs = []
         for selection in selections:
             bundle = selection.bundle
-            need = need_of(headers, bundle, self.memory.total, bundles)
+            more = bytes_of(headers, asked)
+            need = need_of(headers, bundle, self.memory.total, bundles, more)
             prepared = await self._environment(bundle, asked)
             engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
             jobs.append(Job(selection, need, prepared, engine))
