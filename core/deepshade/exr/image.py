@@ -167,8 +167,7 @@ def write(
                 return
             body = io.BytesIO()
             file.write(body)
-        for piece in exrencode.with_entries(body.getbuffer(), entries):
-            stream.write(piece)
+        stream.writelines(exrencode.with_entries(body.getbuffer(), entries))
 
     if isinstance(target, (str, os.PathLike)):
         with replacing(Path(target)) as temporary, temporary.open("wb") as stream:
