@@ -10,7 +10,7 @@ from typing import Any
 
 from deepshade import bench
 from deepshade.bundles import Bundle, write_config
-from deepshade.effects import EFFECTS
+from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.engines import usable
 from deepshade.files import replacing
 from deepshade.machine import cpu_kind, describe
@@ -80,7 +80,7 @@ def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
         "",
         f"Shades `{bundle.effect}` from {', '.join(bundle.inputs)}."
         + (
-            f" Lengths are divided by the effect radius ({bundle.radius:g} scene units unless the "
+            f" Lengths are divided by the effect radius ({SETTINGS['radius'].default} unless the "
             "request or the image's header names one), so any scene scale works."
             if effect.lengths == "radius"
             else " Lengths are divided by the picture's median depth."
