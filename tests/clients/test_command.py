@@ -296,7 +296,7 @@ def test_effects_and_models(run):
     out, _ = run("effects")
     assert "Ambient occlusion" in out
     assert "tiny" in out
-    for said in ("--radius", "scene units", "deepshade:radius, else 0.5", "--environment"):
+    for said in ("--radius", "scene units", "deepshade:radius, else 15%", "--environment"):
         assert said in " ".join(out.split())
     out, _ = run("models", "--json")
     (model,) = json.loads(out)
