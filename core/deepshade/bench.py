@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from deepshade.bundles import Bundle, bundle_folders, bundle_root
 from deepshade.engines import choose, load_engine, usable
@@ -25,11 +26,8 @@ def milliseconds(bundle: Bundle) -> dict[str, float]:
 
     All three runs of a network that runs once a colour channel. Input is ready, and noise.
     """
-    rows, columns = up(HEIGHT, bundle.size_multiple), up(WIDTH, bundle.size_multiple)
-    shape = 3 if bundle.per_channel else 1, bundle.channels, rows, columns
-    gbuffer = np.random.default_rng(0).normal(size=shape).astype(np.float32)
-    if place := channel_slices(bundle.inputs, bundle.per_channel).get("position"):
-        gbuffer[:, place.stop - 1] = -np.abs(gbuffer[:, place.stop - 1]) - 4
+    multiple = bundle.size_multiple
+    gbuffer = noise(bundle, up(HEIGHT, multiple), up(WIDTH, multiple))
     engines = {str(b): load_engine(bundle, b, threads=cpu_count()) for b in usable(bundle)}
     given = (black(bundle.environment),) if bundle.environment else ()
     times: dict[str, list[float]] = {name: [] for name in engines}
@@ -40,6 +38,15 @@ def milliseconds(bundle: Bundle) -> dict[str, float]:
             if turn > 1:
                 times[name].append(1e3 * (time.perf_counter() - start))
     return {name: round(median(taken), 2) for name, taken in times.items()}
+
+
+def noise(bundle: Bundle, height: int, width: int) -> NDArray[np.float32]:
+    """(N, C, height, width): a made-up G-buffer, the same each time, before the camera."""
+    shape = 3 if bundle.per_channel else 1, bundle.channels, height, width
+    gbuffer = np.random.default_rng(0).normal(size=shape).astype(np.float32)
+    if place := channel_slices(bundle.inputs, bundle.per_channel).get("position"):
+        gbuffer[:, place.stop - 1] = -np.abs(gbuffer[:, place.stop - 1]) - 4
+    return gbuffer
 
 
 def bench(
