@@ -23,5 +23,4 @@ light = np.pad(light, ((0, 0), *past), "edge")  # but light goes on
 gbuffer = np.concatenate([depth[None], light])[None].astype(np.float32)
 session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
 (shade,) = session.run(["shade"], {"gbuffer": gbuffer})
-picture = {band: plane[:height, :width].copy() for band, plane in zip("RGB", shade[0])}
-OpenEXR.File({}, picture).write(target)
+OpenEXR.File({}, {"RGB": shade[0, :, :height, :width].transpose(1, 2, 0).copy()}).write(target)

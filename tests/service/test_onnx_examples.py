@@ -46,7 +46,9 @@ def served(start, tmp_path, shot):
     def shade(effect):
         query = f"?half=false&radius={RADIUS}" if effect == "ao" else "?half=false"
         headers = {"Content-Type": "image/x-exr"}
-        response = client.post(f"/shade/{effect}{query}", content=shot.read_bytes(), headers=headers)
+        response = client.post(
+            f"/shade/{effect}{query}", content=shot.read_bytes(), headers=headers
+        )
         assert response.status_code == 200, response.text
         return planes(response.content, effect)
 
@@ -95,7 +97,10 @@ def sdk(program):
         found = library("openvino", "libs/libopenvino.so.*")
         include = found and found.parents[1] / "include"
     else:
-        found, include = library("onnxruntime", "capi/libonnxruntime.so.*"), headers_of_onnxruntime()
+        found, include = (
+            library("onnxruntime", "capi/libonnxruntime.so.*"),
+            headers_of_onnxruntime(),
+        )
         if include is None:
             pytest.skip("no onnxruntime_cxx_api.h: name its folder in ONNXRUNTIME_INCLUDE")
     if found is None or not include.is_dir():
@@ -111,12 +116,9 @@ def test_cpp_gives_the_services_answer(program, served, shot, tmp_path):
     include, found = sdk(program)
     # a package has the library by its full version alone, programs ask for its first number
     (tmp_path / ".".join(found.name.split(".")[:3])).symlink_to(found)
-    built = subprocess.run(
-        [compiler, "-std=c++17", "-isystem", include, EXAMPLES / program, found]
-        + [f"-Wl,-rpath,{found.parent}:{tmp_path}", "-Wall", "-Werror", "-o", tmp_path / "shade"],
-        capture_output=True,
-        text=True,
-    )
+    options = ["-std=c++17", "-Wall", "-Werror", f"-Wl,-rpath,{found.parent}:{tmp_path}"]
+    sources = ["-isystem", include, EXAMPLES / program, found, "-o", tmp_path / "shade"]
+    built = subprocess.run([compiler, *options, *sources], capture_output=True, text=True)
     assert built.returncode == 0, built.stderr[:2000]
     bundle = Bundle.load(ROOT / "models" / "ao" / "fast")
     given = load_gbuffer(shot, bundle.inputs)
@@ -128,7 +130,9 @@ def test_cpp_gives_the_services_answer(program, served, shot, tmp_path):
     done = subprocess.run(run, input=gbuffer.tobytes(), capture_output=True, timeout=120)
     assert done.returncode == 0, done.stderr
     shade = np.frombuffer(done.stdout, np.float32).reshape(1, height, width)
-    np.testing.assert_allclose(shade[:, : given.shape[0], : given.shape[1]], served("ao"), atol=1e-5)
+    np.testing.assert_allclose(
+        shade[:, : given.shape[0], : given.shape[1]], served("ao"), atol=1e-5
+    )
     short = subprocess.run(run, input=b"none", capture_output=True, timeout=120)
     assert short.returncode == 1
     assert f"fewer than {gbuffer.nbytes} bytes" in short.stderr.decode()
