@@ -15,8 +15,8 @@ from typing import Any
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.errors import ConfigError
 from deepshade.machine import cpu_count, describe, memory_bytes
+from deepshade.timing import Pace
 from deepshade_report.method import PAPER
-from deepshade_report.timing import Pace
 from deepshade_report.view import View, load_views
 
 _QUALITIES = ("fast", "balanced", "best")  # of shipped bundles, which come first

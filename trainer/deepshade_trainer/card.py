@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from deepshade import bench
-from deepshade.bundles import Bundle, write_config
+from deepshade.bundles import METRICS, Bundle, write_config
 from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.engines import usable
 from deepshade.files import replacing
@@ -19,6 +20,8 @@ from deepshade_trainer.evaluation import Variant, evaluate, summary
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
 
+# The section on speed, or where it belongs: before what follows the errors.
+_SPEED = re.compile(r"^## Speed\n.*?(?=^## |\Z)|(?=^## (?!Error))|\Z", re.MULTILINE | re.DOTALL)
 MAX_INT8_ADDED = 0.01  # of the DSSIM in fp32
 _WRITTEN = ("path", "metrics", "hashes")
 _COLUMNS = {"ssim": ".4f", "psnr": ".2f", "mae": ".4f", "flip": ".4f", "smape": ".4f"}
@@ -72,6 +75,23 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
     return write_config(bundle.path, {**config, "int8_kinds": sorted(kinds)}, metrics)
 
 
+def record_speed(bundle: Bundle, machine: str, ms: Mapping[str, float]) -> None:
+    """Put a machine's milliseconds at 768 x 512, by backend, in place of what the bundle has.
+
+    In its metrics, and in its card, whose other sections stay.
+    """
+    path = bundle.path / METRICS
+    speed = {"size": [bench.WIDTH, bench.HEIGHT], "ms": dict(ms)}
+    metrics = {**bundle.metrics, "speed": {**bundle.metrics.get("speed", {}), machine: speed}}
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", "utf-8")
+    card = bundle.path / "README.md"
+    section = "\n".join([*speed_section(metrics), ""])
+    text = _SPEED.sub(lambda _: section, card.read_text("utf-8"), count=1)
+    with replacing(card) as temporary:
+        temporary.write_text(text, "utf-8")
+
+
 def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
     """Write the bundle's README.md from its configuration, figures and recipe, if it has one."""
     effect = EFFECTS[bundle.effect]
@@ -94,7 +114,7 @@ def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
         else "Any size will do: a pixel depends on itself alone.",
         "",
         *_errors(bundle),
-        *_speeds(bundle),
+        *speed_section(bundle.metrics),
     ]
     if run is not None:
         recipe = Recipe.read(run.recipe)
@@ -144,15 +164,15 @@ def _errors(bundle: Bundle) -> list[str]:
     return [*lines, ""]
 
 
-def _speeds(bundle: Bundle) -> list[str]:
+def speed_section(metrics: Mapping[str, Any]) -> list[str]:
     """The bare network's speed on each machine that it was measured on."""
-    speeds: dict[str, dict[str, Any]] = bundle.metrics.get("speed", {})
+    speeds: dict[str, dict[str, Any]] = metrics.get("speed", {})
     if not speeds:
         return []
     lines = [
         "## Speed",
         "",
-        "Milliseconds of the bare network.",
+        "Milliseconds of the bare network on a machine that does nothing else, warm, all channels.",
         "",
         "| machine | engine | precision | size | ms |",
         "|---|---|---|---|---|",

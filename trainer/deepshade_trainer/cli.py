@@ -132,11 +132,16 @@ def evaluate(
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Run folder of 'deepshade train'.")],
-    out: Annotated[Path, typer.Option(help="Bundle folder, such as models/ao/balanced.")],
-    data: Annotated[
-        list[Path], typer.Option(help="Data whose G-buffers prove parity; repeatable.")
+    run: Annotated[
+        Path, typer.Argument(help="Run folder of 'deepshade train'; with --to, bundle folder.")
     ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Bundle folder, models/ao/balanced say; with --to any."),
+    ],
+    data: Annotated[
+        list[Path] | None, typer.Option(help="Data whose G-buffers prove parity; repeatable.")
+    ] = None,
     test: Annotated[
         list[Path] | None, typer.Option(help="Test data for the model card; repeatable.")
     ] = None,
@@ -144,12 +149,28 @@ def export(
         float, typer.Option(help="Effect radius of requests that name none, scene units.")
     ] = 1.0,
     note: Annotated[Path | None, typer.Option(help="Text that ends the model card.")] = None,
+    to: Annotated[str, typer.Option(help="'onnx': a bundle's graph for another program.")] = "",
+    size: Annotated[
+        str, typer.Option(help="With --to: WxH in pixels, such as 768x512, or dynamic.")
+    ] = "dynamic",
+    opset: Annotated[int, typer.Option(help="With --to: ONNX opset, 13 to 18.")] = 18,
 ) -> None:
     """Write a bundle, prove that ONNX Runtime equals torch, and measure it for its card.
 
     deepshade export runs/ao --out models/ao/balanced --data data/ao --test data/test
+
+    With --to, write a bundle's graph for a program of your own instead (docs/onnx.md):
+
+    deepshade export models/ao/fast --to onnx --size 768x512 -o graphs
     """
     from deepshade.errors import ConfigError
+
+    if to:
+        _export_to(run, to, out, size, opset)
+        return
+    if not data:
+        raise ConfigError("data", detail="name the data that it was trained on: --data data/ao")
+
     from deepshade_trainer.card import measure, write_card
     from deepshade_trainer.export import export as write
     from deepshade_trainer.run import Run
@@ -163,6 +184,26 @@ def export(
         bundle = measure(bundle, test)
     write_card(bundle, Run(run), ending)
     typer.echo(f"{out}: sha256 {bundle.short_hash}, ONNX Runtime within {worst:.1e} of torch")
+
+
+def _export_to(path: Path, to: str, folder: Path, size: str, opset: int) -> None:
+    """Write the bundle's graph to `folder` and say what it is made of."""
+    from deepshade.bundles import Bundle
+    from deepshade.errors import ConfigError
+    from deepshade_trainer.interchange import write_plain
+
+    if to != "onnx":
+        raise ConfigError("to", ["onnx"], detail=f"--to {to}: what there is is onnx")
+    width, _, height = size.partition("x")
+    if size != "dynamic" and not (width.isdecimal() and height.isdecimal()):
+        raise ConfigError("size", detail=f"--size {size}: give WxH, such as 768x512, or dynamic")
+    sides = None if size == "dynamic" else (int(width), int(height))
+    made = write_plain(Bundle.load(path), folder, sides, opset)
+    typer.echo(
+        f"{made.path}: {sum(made.operators.values())} nodes of {len(made.operators)} kinds, opset "
+        f"{opset}; ONNX Runtime's answers are within {made.difference:.0e} of the bundle's"
+    )
+    typer.echo(", ".join(f"{count} {name}" for name, count in made.operators.most_common()))
 
 
 def _parse(settings: list[str]) -> dict[str, Any]:
