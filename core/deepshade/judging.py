@@ -91,7 +91,7 @@ def nothing_shown(effect: Effect, where: str, least: float) -> DataError:
         fix = "other scenes, or more --views"
     return DataError(
         f"no view of {where} counts: of none the {measure} of at least {least:g}",
-        fix=f"render views that show more: {fix}; 'deepshade evaluate --min-contrast' counts others",
+        fix=f"render views that show more: {fix}, or see 'deepshade evaluate --min-contrast'",
     )
 
 

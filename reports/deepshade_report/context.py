@@ -80,7 +80,7 @@ class Context:
         if found := sample_views(self.data, self.effect)[:limit]:
             return found
         raise DataError(
-            f"no EXR file of {self.data} has a reference of '{self.effect}'",
+            f"no EXR file of {self.data} has a reference of '{self.effect}' that shows something",
             fix=f"render one: deepshade render --effects {self.effect}, or datagen for many",
         )
 

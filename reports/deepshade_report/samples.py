@@ -19,13 +19,14 @@ from deepshade_report.view import View
 
 
 def sample_views(folder: Path, effect: str) -> list[View]:
-    """The views of a folder's EXR files that have a reference of `effect`.
+    """The views of a folder's EXR files that have a reference of `effect` which shows something.
 
     What an effect takes is derived where a file leaves it out. Raises what `load_gbuffer` does, and
     CameraError where the header has no field of view.
     """
     found = (_view(path, effect) for path in sorted(folder.glob("*.exr")))
-    return [view for view in found if view is not None]
+    least = EFFECTS[effect].min_contrast
+    return [view for view in found if view is not None and view.contrast() >= least]
 
 
 def _view(path: Path, effect: str) -> View | None:

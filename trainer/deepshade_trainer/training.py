@@ -90,8 +90,8 @@ class _Trainer:
         self.warnings: list[str] = []
         if recipe.schedule_is_cut:
             self.warnings.append(
-                f"the warm-up of {recipe.warmup} steps is longer than the run of {recipe.steps}: the "
-                f"rate never reaches {recipe.lr:g}; --set warmup={recipe.steps // 10} would do"
+                f"the warm-up of {recipe.warmup} steps is longer than the run of {recipe.steps}: "
+                f"the rate never reaches {recipe.lr:g}; --set warmup={recipe.steps // 10} would do"
             )
         if held and self.data.one_scene:
             self.warnings.append(

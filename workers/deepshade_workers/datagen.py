@@ -407,8 +407,8 @@ def _connect(address: str | None) -> None:
     except (OSError, ray.exceptions.AuthenticationError) as error:
         raise DataError(
             f"there is no Ray cluster for us at {where}: {error}",
-            fix="start one with 'ray start --head', or leave --address out; one with a token lets in "
-            "who has the same in ~/.ray/auth_token or RAY_AUTH_TOKEN, and RAY_AUTH_MODE=token",
+            fix="start one with 'ray start --head', or leave --address out; where it has a token, "
+            "set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN to what 'ray get-auth-token' prints there",
         ) from error
     except Exception as error:  # Ray has no type of its own for it
         if "timed out during startup" not in str(error):
