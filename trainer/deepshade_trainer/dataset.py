@@ -100,7 +100,7 @@ class Dataset:
         """
         names = [str(entry.record["scene"]) for entry in self.entries]
         if self.one_scene:
-            names = [f"{entry.record['scene']}:{entry.record['seed']}" for entry in self.entries]
+            names = [str(entry.record.get("seed", entry.name)) for entry in self.entries]
             fraction = max(fraction, HELD_VIEWS) if fraction > 0 else 0.0
         hashes = [_unit(f"{seed}:{name}") for name in names]
         if fraction > 0 and len(set(hashes)) > 1:

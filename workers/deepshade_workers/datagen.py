@@ -35,6 +35,7 @@ from deepshade_workers.view import MIN_CONTRAST, Images, Limits, Vector, View
 
 # How often a sample whose scene shows nothing useful may ask for another scene.
 SCENE_TRIES = 16
+STARTS = 3  # of Ray, which gives a busy machine no more than 30 s for one
 MAX_SHARD = 128  # samples
 # Attributes that the camera and the scene's shape alone decide.
 GEOMETRY = {"position", "normal", "normal_world", "depth", "view", "view_angle"}
@@ -403,17 +404,22 @@ def _connect(address: str | None) -> None:
     try:
         if host and port.isdigit():  # where nothing listens Ray itself would try for minutes
             socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
-        ray.init(address=where, **options)
+        for tries in range(STARTS, 0, -1):
+            try:
+                ray.init(address=where, **options)
+                return
+            except Exception as error:  # Ray has no type of its own for it
+                ray.shutdown()
+                if "timed out during startup" not in str(error):
+                    raise
+                if tries == 1:
+                    raise DataError(
+                        f"Ray did not start within its 30 s, {STARTS} times",
+                        fix="the machine is busy: run the same command again",
+                    ) from error
     except (OSError, ray.exceptions.AuthenticationError) as error:
         raise DataError(
             f"there is no Ray cluster for us at {where}: {error}",
             fix="start one with 'ray start --head', or leave --address out; where it has a token, "
             "set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN to what 'ray get-auth-token' prints there",
-        ) from error
-    except Exception as error:  # Ray has no type of its own for it
-        if "timed out during startup" not in str(error):
-            raise
-        raise DataError(
-            "Ray did not start within its 30 s",
-            fix="the machine is busy: run the same command again",
         ) from error
