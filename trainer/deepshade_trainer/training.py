@@ -307,7 +307,7 @@ def _device(name: str) -> torch.device:
     if kind not in ("cpu", "cuda") or (number and not number.isdecimal()):
         raise ConfigError(name, detail=f"no device is called {name!r}: cpu, cuda or cuda:1")
     if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
-        built = torch.version.cuda  # type: ignore[attr-defined]
+        built = torch.version.cuda
         raise ConfigError(
             "device",
             detail=f"PyTorch finds no device '{name}': "
