@@ -21,6 +21,7 @@ from safetensors.numpy import load_file
 
 from deepshade import exr
 from deepshade.camera import Camera
+from deepshade.effects import EFFECTS
 from deepshade.environments.stored import read_stored, stored_path
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
@@ -28,6 +29,7 @@ from deepshade.manifest import Manifest, Shard
 from deepshade_workers.datagen import (
     DataSpec,
     _complete,
+    default_shard_size,
     expand_scenes,
     generate,
     make_sample,
@@ -216,6 +218,19 @@ def test_scene_names_expand(tmp_path: Path) -> None:
 def test_impossible_jobs_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         DataSpec(**{"scenes": SCENES, "views": 1, **change})
+
+
+def test_every_view_counts_where_it_is_measured() -> None:
+    """Occlusion is asked for what its row measures; what sees light only has less to show of it."""
+    assert DataSpec(SCENES, 1).settings()["min_contrast"] == EFFECTS["ao"].min_contrast
+    assert DataSpec(SCENES, 1, effects=("gi", "dof")).settings()["min_contrast"] == 0.06
+    assert DataSpec(SCENES, 1, min_contrast=0.01).settings()["min_contrast"] == 0.01
+
+
+def test_shards_are_a_sixteenth_of_the_views(tmp_path: Path) -> None:
+    assert [default_shard_size(n, tmp_path) for n in (1, 48, 2048, 20_000)] == [1, 3, 128, 128]
+    Manifest(SPEC.settings(), {}).write(tmp_path)
+    assert default_shard_size(2048, tmp_path) == SPEC.shard_size
 
 
 def test_another_job_does_not_go_on(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -41,20 +41,24 @@ def variants(bundle: Bundle) -> dict[str, Variant]:
     return found
 
 
-def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
+def measure(
+    bundle: Bundle, folders: Sequence[Path], tell: Callable[[str], object] = lambda _: None
+) -> Bundle:
     """The bundle with errors over each test folder and this machine's speed in its metrics.
 
     `error` holds, for each folder, the summary under every variant of the inputs in fp32, and in
     the 16 and 8 bits of this machine. Where 8 bits add little error on all folders, they are
-    allowed on this kind of CPU.
+    allowed on this kind of CPU. `tell` hears what is being measured.
     """
     errors: dict[str, dict[str, Any]] = {folder.name: {} for folder in folders}
     for folder in folders:
         found = errors[folder.name]
         for name, variant in variants(bundle).items():
+            tell(f"measuring on {folder}: {name}")
             found[name] = summary(list(evaluate(bundle, [folder], variant=variant)))
         for backend in usable(bundle):
             if backend.precision != "fp32":
+                tell(f"measuring on {folder}: {backend}")
                 mean = summary(list(evaluate(bundle, [folder], backend=backend)))
                 found[f"exact, {backend}"] = mean
     kinds = set(bundle.int8_kinds) - {cpu_kind()}
@@ -66,6 +70,7 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
     ]
     if added and max(added) <= MAX_INT8_ADDED:
         kinds.add(cpu_kind())
+    tell("measuring its speed")
     speeds = {
         **bundle.metrics.get("speed", {}),
         describe(): {"size": [bench.WIDTH, bench.HEIGHT], "ms": bench.milliseconds(bundle)},
@@ -130,7 +135,8 @@ def _errors(bundle: Bundle) -> list[str]:
     """Error over each test set under every variant, beside the trivial answer's."""
     errors: dict[str, dict[str, Any]] = bundle.metrics.get("error", {})
     if not errors:
-        return []
+        told = "Not measured: 'deepshade export' without --test, or no test view that counts."
+        return ["## Error", "", told, ""]
     effect = EFFECTS[bundle.effect]
     measures = {
         "deviation": "whose reference has a standard deviation of",

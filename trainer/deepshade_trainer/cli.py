@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from deepshade_trainer.training import Progress
 
 Effect = Annotated[str, typer.Argument(help="Effect to train, such as 'ao'.")]
 Data = Annotated[list[Path], typer.Option(help="Data folder of 'deepshade datagen'; repeatable.")]
@@ -26,18 +29,20 @@ def train(
     device: Annotated[str, typer.Option(help="'cpu' or 'cuda'.")] = "cpu",
     threads: Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)] = 0,
 ) -> None:
-    """Train a shader. Ctrl-C saves and stops; the same command goes on.
+    """Train a shader. Ctrl-C saves and stops, with exit code 130; the same command goes on.
 
     Examples:
 
     deepshade train ao --data data/ao --out runs/ao
 
+    deepshade train ao --data data/mine --out runs/mine --set init_from=models/ao/balanced \
+--set steps=60 --set warmup=6 --set lr=0.0008
+
     deepshade train ao --data data/ao --out runs/paper --preset paper --set steps=6000
     """
     import torch
-    from rich import progress as bars
-    from rich.console import Console
 
+    from deepshade.console import Watch
     from deepshade_trainer.recipe import preset as load_preset
     from deepshade_trainer.run import Run
     from deepshade_trainer.training import train as steps
@@ -45,28 +50,29 @@ def train(
     if threads:
         torch.set_num_threads(threads)
     recipe = load_preset(preset, effect).changed(**_parse(settings or []))
-    console = Console(stderr=True)
-    columns = (
-        bars.TextColumn("training"),
-        bars.BarColumn(),
-        bars.MofNCompleteColumn(),
-        bars.TextColumn("{task.fields[loss]}"),
-        bars.TimeElapsedColumn(),
-        bars.TimeRemainingColumn(),
-    )
-    with bars.Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=recipe.steps, loss="")
+    done = recipe.steps  # a run that is complete yields nothing
+    with Watch("training", "steps") as watch:
         for progress in steps(recipe, data, Run(out), device=device):
-            bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.4f}")
+            done = progress.step
             if progress.warning:
-                console.print(progress.warning, style="yellow")
+                watch.say(progress.warning, "yellow")
+            watch.update(done, recipe.steps, f"loss {progress.loss:.4f}" if done else "")
             if progress.figures:
-                console.print(
-                    f"step {progress.step}: loss {progress.loss:.4f}  held-out DSSIM "
-                    f"{progress.figures['dssim']:.4f} ({progress.figures['ratio']:.3f} x the "
-                    f"trivial answer's)  MAE {progress.figures['mae']:.4f}"
-                )
+                watch.say(_figures(progress))
     typer.echo(f"the run is in {out}")
+    if done < recipe.steps:
+        typer.echo(f"stopped at step {done} of {recipe.steps}; the same command goes on", err=True)
+        raise typer.Exit(130)
+
+
+def _figures(progress: Progress) -> str:
+    """A validation in a line."""
+    found = progress.figures or {}
+    loss = f"loss {progress.loss:.4f}  " if progress.step else ""
+    return (
+        f"step {progress.step}: {loss}held-out DSSIM {found['dssim']:.4f} "
+        f"({found['ratio']:.3f} x the trivial answer's)  MAE {found['mae']:.4f}"
+    )
 
 
 def evaluate(
@@ -102,9 +108,10 @@ def evaluate(
 
     from deepshade import pictures
     from deepshade.bundles import Bundle
+    from deepshade.console import stdout
     from deepshade.effects import EFFECTS
     from deepshade.engines import Backend
-    from deepshade_trainer.evaluation import Variant, contact_sheet, document, summary
+    from deepshade_trainer.evaluation import Variant, contact_sheet, document, short_names, summary
     from deepshade_trainer.evaluation import evaluate as measure
 
     found = Bundle.load(bundle)
@@ -121,13 +128,14 @@ def evaluate(
         typer.echo(json.dumps(document(found, rows, variant, backend)))
         return
     shown = ("ssim", "psnr", "mae", "flip", "dssim", "trivial_dssim")
-    listing = Table("scene", *shown)
-    for row in rows:
-        listing.add_row(row.scene, *(f"{row.figures[name]:.4f}" for name in shown))
+    listing = Table("view", "scene", *shown)
+    for row, scene in zip(rows, short_names([row.scene for row in rows]), strict=True):
+        figures = (f"{row.figures[name]:.4f}" for name in shown)
+        listing.add_row(str(row.number), scene, *figures)
     mean = summary(rows)
     listing.add_section()
-    listing.add_row(f"mean of {len(rows)}", *(f"{mean[name]:.4f}" for name in shown))
-    Console().print(listing)
+    listing.add_row("mean", f"of {len(rows)} views", *(f"{mean[name]:.4f}" for name in shown))
+    stdout().print(listing)
     typer.echo(f"DSSIM is {mean['ratio']:.3f} x the trivial answer's, on {backend}")
 
 
@@ -163,6 +171,8 @@ def export(
 
     deepshade export models/ao/fast --to onnx --size 768x512 -o graphs
     """
+    from functools import partial
+
     from deepshade.errors import ConfigError
 
     if to:
@@ -180,10 +190,13 @@ def export(
     except OSError as error:
         raise ConfigError("note", detail=f"can't read {note}: {error.strerror}") from error
     bundle, worst = write(Run(run), out, data, radius=radius)
-    if test:
-        bundle = measure(bundle, test)
-    write_card(bundle, Run(run), ending)
+    write_card(bundle, Run(run), ending)  # a bundle has one, whatever its measurement meets
     typer.echo(f"{out}: sha256 {bundle.short_hash}, ONNX Runtime within {worst:.1e} of torch")
+    if test:
+        tell = partial(typer.echo, err=True)
+        write_card(measure(bundle, test, tell), Run(run), ending)
+    else:
+        typer.echo("not measured, as its card says: --test names views that it wasn't trained on")
 
 
 def _export_to(path: Path, to: str, folder: Path, size: str, opset: int) -> None:

@@ -225,8 +225,12 @@ def datagen(
         float | None, typer.Option(help="Effect radius, scene units.  [default: drawn per view]")
     ] = None,
     min_contrast: Annotated[
-        float, typer.Option(help="Least standard deviation of a view's occlusion.")
-    ] = 0.06,
+        float | None,
+        typer.Option(
+            help="Least standard deviation of a view's occlusion.  [default: what is measured on: "
+            "0.12 with ao, else 0.06]"
+        ),
+    ] = None,
     max_blur: Annotated[float, typer.Option(help="Largest blur circles drawn, pixels.")] = 48.0,
     max_motion: Annotated[float, typer.Option(help="Largest motions drawn, pixels.")] = 64.0,
     max_scatter: Annotated[
@@ -245,7 +249,10 @@ def datagen(
     layers: Annotated[
         str, typer.Option(help="More to render, commas between: do_visibility, do_directions.")
     ] = "",
-    shard_size: Annotated[int, typer.Option(help="Samples in a shard.", min=1)] = 128,
+    shard_size: Annotated[
+        int | None,
+        typer.Option(help="Samples in a shard.  [default: views / 16, 128 at most]", min=1),
+    ] = None,
     address: Annotated[
         str | None, typer.Option(help="A running Ray cluster.  [default: one of its own]")
     ] = None,
@@ -266,7 +273,7 @@ def datagen(
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
-    from deepshade_workers.datagen import DataSpec, expand_scenes, generate
+    from deepshade_workers.datagen import DataSpec, default_shard_size, expand_scenes, generate
 
     spec = DataSpec(
         scenes=expand_scenes(scenes),
@@ -278,7 +285,7 @@ def datagen(
         seed=seed,
         radius=radius,
         min_contrast=min_contrast,
-        shard_size=shard_size,
+        shard_size=shard_size or default_shard_size(views, out),
         max_blur=max_blur,
         max_motion=max_motion,
         max_scatter=max_scatter,
@@ -301,28 +308,16 @@ def datagen(
 
 
 def _watched(steps: Iterator[tuple[int, int]], *, hidden: bool) -> tuple[int, int]:
-    """Samples (done, newly rendered) after all `steps` of (done, in all).
+    """Samples (done, newly rendered) after all `steps` of (done, in all)."""
+    from deepshade.console import Watch
 
-    They show as a bar on a terminal, as a line every 15 s elsewhere.
-    """
-    from rich import progress
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    plain = not console.is_terminal
-    columns = ("rendering", progress.BarColumn(), progress.MofNCompleteColumn())
-    times = ("{task.fields[rate]}", progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
-    begun = said = time.monotonic()
-    first, done = None, 0
-    with progress.Progress(*columns, *times, console=console, disable=plain or hidden) as bar:
-        task = bar.add_task("", total=None, rate="")
-        for done, total in steps:
-            first = done if first is None else first
-            now = time.monotonic()
-            rate = (done - first) / max(now - begun, 1e-9)
-            bar.update(task, completed=done, total=total, rate=f"{rate:.2f}/s")
-            if plain and not hidden and now - said > 15:
-                said = now
-                left = f"{(total - done) / rate / 60:.1f} min left" if rate else ""
-                console.print(f"rendering {done}/{total}  {rate:.2f}/s  {left}")
+    first, done, total = None, 0, 0
+    with Watch("rendering", "views", hidden=hidden) as watch:
+        try:
+            for done, total in steps:
+                first = done if first is None else first
+                watch.update(done, total)
+        except KeyboardInterrupt:
+            watch.say(f"stopped at {done} of {total} views; the same command goes on")
+            raise
     return done, done - (first or 0)
