@@ -27,7 +27,14 @@ def inspect(
     ] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
 ) -> None:
-    """Show what EXR files hold, what it maps to, and what each effect still needs."""
+    """Show what EXR files hold, what it maps to, and what each effect still needs.
+
+    Examples:
+
+      deepshade inspect shot.exr
+
+      deepshade inspect shot_normal.exr shot_depth.exr --map normal=MyLayer.N --fov 40
+    """
     from deepshade.gbuffer.channels import parse_mapping
 
     report = inspect_files(files, mapping=parse_mapping(map_ or ()), profile=profile, fov=fov)
