@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from deepshade.bundles import Bundle, bundle_folders, bundle_root
+from deepshade.bundles import Bundle, bundle_folders, bundle_roots
 from deepshade.engines import choose, load_engine, usable
 from deepshade.environments import black
 from deepshade.machine import cpu_count, describe
@@ -47,7 +47,10 @@ def noise(bundle: Bundle, height: int, width: int) -> NDArray[np.float32]:
 
 
 def bench(
-    models: Annotated[Path | None, typer.Option(help="Folder of bundles.")] = None,
+    models: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of bundles; repeatable. Default: as 'deepshade serve'."),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Time every bundle on every engine and precision here; * is what a request gets.
@@ -61,7 +64,7 @@ def bench(
     from deepshade.console import stdout
 
     rows: list[dict[str, Any]] = []
-    for bundle in map(Bundle.load, bundle_folders(models or bundle_root())):
+    for bundle in map(Bundle.load, bundle_folders(*bundle_roots(models or ()))):
         chosen = str(choose(bundle))
         for backend, ms in milliseconds(bundle).items():
             name = f"{bundle.effect}/{bundle.name}"

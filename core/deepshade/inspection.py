@@ -34,7 +34,14 @@ def inspect(
         typer.Option(help="The camera's matrix: 16 numbers, row by row, for column vectors."),
     ] = None,
 ) -> None:
-    """Show what EXR files hold, what it maps to, and what each effect still needs."""
+    """Show what EXR files hold, what it maps to, and what each effect still needs.
+
+    Examples:
+
+      deepshade inspect shot.exr
+
+      deepshade inspect shot_normal.exr shot_depth.exr --map normal=MyLayer.N --fov 40
+    """
     from deepshade.camera import parse_matrix
     from deepshade.gbuffer.channels import parse_mapping
 
