@@ -145,7 +145,12 @@ class Surface:
         texels[..., 3], texels[..., 7] = self.metallic, self.roughness
         texels[..., 4:7] = self.specular
         if base is not None:
-            texels[..., :3] *= to_linear(_bytes(base, size)[..., :3])
+            found = _bytes(base, size)
+            colour = to_linear(found[..., :3])
+            there = found[..., 3] * self.alpha >= (self.cutoff or 0)
+            if there.any():  # what is cut away shall not bleed into what is blended with it
+                colour[~there] = colour[there].mean(0)
+            texels[..., :3] *= colour
         if rough is not None:
             found = _bytes(rough, size)
             texels[..., 7] *= found[..., 1]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from pathlib import Path
 
 from deepshade.errors import SceneError, nearest
@@ -106,6 +107,23 @@ def load_mesh(path: Path) -> Mesh:
     if not len(mesh.faces):
         raise SceneError(f"{path} holds no triangles")
     return mesh
+
+
+def notes_of(names: Iterable[str]) -> tuple[str, ...]:
+    """What is missing of the mesh files among scenes' `names`: some textures, say.
+
+    Raises:
+        SceneError: a file can't be read.
+    """
+    paths: dict[Path, None] = {}
+    for name in names:
+        kind = name.split(":")[0]
+        if kind == COMPOSED:
+            found = files_of(parse_composed(name)[0], frozenset(MESH_SUFFIXES))
+        else:
+            found = (Path(name),)
+        paths |= {path: None for path in found if path.suffix.lower() in MESH_SUFFIXES}
+    return tuple(note for path in paths if path.is_file() for note in load_mesh(path).notes)
 
 
 _kept = functools.lru_cache(maxsize=256)(load_mesh)

@@ -48,6 +48,11 @@ class Scene:
     painting: Painting | None = field(default=None, repr=False)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What of its files could not be had."""
+        return () if self.mesh is None else self.mesh.notes
+
+    @property
     def diagonal(self) -> float:
         """Length of the bounding box's diagonal, scene units."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))

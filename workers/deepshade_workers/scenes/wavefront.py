@@ -52,7 +52,7 @@ def load_obj(path: Path, resources: Resources) -> tuple[Any, dict[str, Surface]]
             except (OSError, ValueError):
                 resources.note(f"its material library {name} is missing: all of it is grey")
                 continue
-            surfaces |= read_mtl(data, resources)
+            surfaces |= read_mtl(data, resources, used)
     unknown = [name for name in used if name not in surfaces]
     if unknown and not listed:
         resources.note("it names materials but no material library: they are grey")
@@ -66,8 +66,8 @@ def load_obj(path: Path, resources: Resources) -> tuple[Any, dict[str, Surface]]
     return loaded, surfaces
 
 
-def read_mtl(text: str, resources: Resources) -> dict[str, Surface]:
-    """Surfaces of a material library by name.
+def read_mtl(text: str, resources: Resources, used: Sequence[str]) -> dict[str, Surface]:
+    """Surfaces of those materials of a library that are `used`, by name.
 
     Kd and map_Kd are the base colour, Ks and Ns reflectance and exponent of the highlight where
     `illum` has one, d (or 1 - Tr) the opacity. Where Kd and Ks sum to more than 1 Ks is what Kd
@@ -81,7 +81,7 @@ def read_mtl(text: str, resources: Resources) -> dict[str, Surface]:
             terms = found.setdefault(rest.strip(), {})
         elif rest.strip():
             terms[key.lower()] = rest.strip()
-    return {name: _surface(terms, resources) for name, terms in found.items()}
+    return {name: _surface(found[name], resources) for name in used if name in found}
 
 
 def _surface(terms: Mapping[str, str], resources: Resources) -> Surface:
