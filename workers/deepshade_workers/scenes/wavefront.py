@@ -43,7 +43,7 @@ def load_obj(path: Path, resources: Resources) -> tuple[Any, dict[str, Surface]]
     used = [name.strip() for name in re.findall(r"(?m)^[ \t]*usemtl[ \t]+(.+)$", text)]
     used = list(dict.fromkeys(used))
     surfaces: dict[str, Surface] = {}
-    listed = False
+    listed = opened = False
     for line in re.findall(r"(?m)^[ \t]*mtllib[ \t]+(.+)$", text):
         for name in _libraries(line.strip(), path.parent):
             listed = True
@@ -52,11 +52,12 @@ def load_obj(path: Path, resources: Resources) -> tuple[Any, dict[str, Surface]]
             except (OSError, ValueError):
                 resources.note(f"its material library {name} is missing: all of it is grey")
                 continue
+            opened = True
             surfaces |= read_mtl(data, resources, used)
     unknown = [name for name in used if name not in surfaces]
     if unknown and not listed:
         resources.note("it names materials but no material library: they are grey")
-    elif unknown and surfaces:
+    elif unknown and opened:
         resources.note(f"its material {unknown[0]} is in no library: it is grey")
     if not listed:
         text = f"mtllib none\n{text}"  # else trimesh forgets which material is where
