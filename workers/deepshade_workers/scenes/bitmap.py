@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
 from collections.abc import Sequence
@@ -56,19 +57,7 @@ class Picture:
         Raises:
             OSError: it is damaged, or of an unknown format (Pillow says which).
         """
-        from PIL import Image
-
-        with Image.open(io.BytesIO(self.data)) as found:
-            if found.mode.startswith("I"):  # 16-bit greys, which `convert` would clip
-                grey = np.asarray(found, np.float64) / 257
-                image = Image.fromarray(grey.astype(np.uint8)).convert("RGBA")
-            else:
-                image = found.convert("RGBA")
-        scale = MAX_SIDE / max(image.size)
-        if scale >= 1:
-            return image
-        width, height = (max(1, round(side * scale)) for side in image.size)
-        return image.resize((width, height), Image.Resampling.BOX)
+        return _decoded(self)
 
 
 @dataclass(frozen=True)
@@ -99,6 +88,7 @@ class Surface:
         """Whether one material says it all."""
         return not (self.base_picture or self.metal_rough or self.specular_picture)
 
+    @functools.cached_property
     def material(self) -> Material:
         """The Phong terms of the factors alone."""
         row = self._texels()[0, 0]
@@ -109,6 +99,7 @@ class Surface:
             exponent(float(row[7])),
         )
 
+    @functools.cached_property
     def bitmap(self) -> Bitmap:
         """The texels; the same object for equal surfaces, of whichever files, while one is used.
 
@@ -137,31 +128,50 @@ class Surface:
         return self.base_picture, self.metal_rough, self.specular_picture
 
     def _texels(self, base: Any = None, rough: Any = None, shine: Any = None) -> Floats:
-        """(H, W, 8) float64 from the pictures' images, all at the largest one's size."""
+        """(H, W, 8) from the pictures' images, all at the largest one's size."""
         images = [image for image in (base, rough, shine) if image is not None]
         size = max((image.size for image in images), default=(1, 1))
-        texels = np.empty((size[1], size[0], 8))
+        kind = np.float32 if images else np.float64  # constants are exact
+        texels = np.empty((size[1], size[0], 8), kind)
         texels[..., :3] = self.base
         texels[..., 3], texels[..., 7] = self.metallic, self.roughness
         texels[..., 4:7] = self.specular
         if base is not None:
             found = _bytes(base, size)
-            colour = to_linear(found[..., :3])
-            there = found[..., 3] * self.alpha >= (self.cutoff or 0)
-            if there.any():  # what is cut away shall not bleed into what is blended with it
+            colour = LINEAR[found[..., :3]]
+            there = found[..., 3] * (self.alpha / 255) >= (self.cutoff or 0)
+            if there.any() and not there.all():
+                # what is cut away shall not bleed into what is blended with it
                 colour[~there] = colour[there].mean(0)
             texels[..., :3] *= colour
         if rough is not None:
             found = _bytes(rough, size)
-            texels[..., 7] *= found[..., 1]
-            texels[..., 3] *= found[..., 2]
+            texels[..., 7] *= found[..., 1] / np.float32(255)
+            texels[..., 3] *= found[..., 2] / np.float32(255)
         if shine is not None:
             found = _bytes(shine, size)
-            texels[..., 4:7] *= to_linear(found[..., :3])
-            texels[..., 7] = 1 - (1 - texels[..., 7]) * found[..., 3]
+            texels[..., 4:7] *= LINEAR[found[..., :3]]
+            texels[..., 7] = 1 - (1 - texels[..., 7]) * (found[..., 3] / np.float32(255))
         if self.conserving:
             texels[..., :3] *= 1 - texels[..., 4:7].max(-1, keepdims=True)
         return texels
+
+
+@functools.lru_cache(maxsize=8)
+def _decoded(picture: Picture) -> Any:
+    from PIL import Image
+
+    with Image.open(io.BytesIO(picture.data)) as found:
+        if found.mode.startswith("I"):  # 16-bit greys, which `convert` would clip
+            grey = np.asarray(found, np.float64) / 257
+            image = Image.fromarray(grey.astype(np.uint8)).convert("RGBA")
+        else:
+            image = found.convert("RGBA")
+    scale = MAX_SIDE / max(image.size)
+    if scale >= 1:
+        return image
+    width, height = (max(1, round(side * scale)) for side in image.size)
+    return image.resize((width, height), Image.Resampling.BOX)
 
 
 _BITMAPS: WeakValueDictionary[str, Bitmap] = WeakValueDictionary()
@@ -217,6 +227,10 @@ def _halved(values: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
     return np.asarray(np.diff(at, axis=axis) * np.float32(half / count))
 
 
-def _bytes(image: Any, size: Sequence[int]) -> Floats:
-    """(H, W, 4) values in [0, 1] of an image, resampled if its size is another."""
-    return np.asarray(image if image.size == tuple(size) else image.resize(size)) / 255
+def _bytes(image: Any, size: Sequence[int]) -> NDArray[np.uint8]:
+    """(H, W, 4) values of an image, resampled if its size is another."""
+    return np.asarray(image if image.size == tuple(size) else image.resize(size))
+
+
+# Of 8-bit sRGB values.
+LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)

@@ -59,7 +59,7 @@ def _unwrapped(
 
 def _quartered(places: Floats, there: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Floats]:
     """What remains of triangles (F, 3, 2) in texels: pieces' triangles and corners' weights."""
-    sums = np.pad(np.tile(there, (2, 2)), ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+    sums = np.pad(np.tile(there, (2, 2)), ((1, 0), (1, 0))).cumsum(0, np.int32).cumsum(1)
     size = np.array(there.shape[::-1])
     parents = np.arange(len(places))
     weights = np.tile(np.eye(3), (len(places), 1, 1))

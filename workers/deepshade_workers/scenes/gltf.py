@@ -285,7 +285,7 @@ def _primitive(
         return None  # squashed flat: some exporters hide things so
     texturing = document.surface(primitive.get("material"))
     paint = _paint(texturing, arrays, faces)
-    material = None if texturing.surface is None else texturing.surface.material()
+    material = None if texturing.surface is None else texturing.surface.material
     mesh = Mesh.of_file(vertices, faces, normals, material=material, paint=paint)
     mesh = mesh.transformed(matrix)
     surface = texturing.surface
@@ -375,5 +375,5 @@ def _paint(
         found = replace(found, uv=placed[faces])
     if colour is not None:
         found = replace(found, colour=colour[faces][..., :3])
-    bitmap = (surface or BARE).bitmap()
+    bitmap = (surface or BARE).bitmap
     return replace(found, bitmap=np.zeros(len(faces), np.int64), bitmaps=(bitmap,))

@@ -50,7 +50,7 @@ def _convert(part: Any, surfaces: Mapping[str, Surface], path: Path, resources: 
     paint = None
     if colour is not None or (surface is not None and not surface.plain):
         paint = Paint.none(len(faces))
-        bitmap = (surface or BARE).bitmap()
+        bitmap = (surface or BARE).bitmap
         paint = replace(paint, bitmap=np.zeros(len(faces), np.int64), bitmaps=(bitmap,))
         uv = getattr(part.visual, "uv", None)
         if uv is not None and len(uv) == len(vertices):
@@ -58,7 +58,7 @@ def _convert(part: Any, surfaces: Mapping[str, Surface], path: Path, resources: 
             paint = replace(paint, uv=(np.asarray(uv)[:, :2] * (1, -1) + (0, 1))[faces])
         if colour is not None:
             paint = replace(paint, colour=colour)
-    material = None if surface is None else surface.material()
+    material = None if surface is None else surface.material
     mesh = Mesh.of_file(vertices, faces, normals, material=material, paint=paint)
     if surface is None:
         return mesh
