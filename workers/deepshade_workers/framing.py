@@ -120,7 +120,8 @@ def _surface_points(scene: Scene) -> Floats:
         even = (weights[:, :, None] * chosen).sum(1)
         return np.concatenate([scene.points[:: max(1, len(scene.points) // POINTS)], even])
     toward = rng.normal(size=(3, POINTS))
-    origin = rng.uniform(*scene.bounds, (POINTS, 3)).T
+    low, high = scene.bounds
+    origin = (low + rng.random((POINTS, 3)) * (high - low)).T
     ray = mi.Ray3f(
         mi.Point3f(origin.astype(np.float32)),
         mi.Vector3f((toward / np.linalg.norm(toward, axis=0)).astype(np.float32)),

@@ -20,6 +20,8 @@ from deepshade_workers.scenes.bitmap import CLAMP, MAX_SIDE, MIRROR, REPEAT, Bit
 
 mi = mitsuba()
 
+HALF: Any = dr.float16_array_t(mi.Float)
+QUADRUPLE: Any = dr.float16_array_t(mi.Vector4f)
 LEVELS = MAX_SIDE.bit_length()
 # Texels of all textures, 16 bytes each: where there are more, the largest are halved.
 BUDGET = 24_000_000
@@ -55,7 +57,7 @@ class Painting:
             manners[number] = len(pyramid), *bitmap.wrap, bitmap.nearest
         flat = np.concatenate([level.ravel() for pyramid in pyramids for level in pyramid])
         return cls(
-            dr.float16_array_t(mi.Float)(flat),
+            HALF(flat),
             mi.UInt32(places.ravel()),
             mi.UInt32(manners.ravel()),
             coloured,
@@ -103,11 +105,10 @@ class Painting:
         place = dr.gather(mi.Vector3u, self.places, number * LEVELS + level, valid)
         left, right, fx = _neighbours(uv.x, place.y, manner.y, manner.w)
         top, bottom, fy = _neighbours(uv.y, place.z, manner.z, manner.w)
-        quadruple = dr.float16_array_t(mi.Vector4f)
 
         def at(row: Any, column: Any, half: int) -> Any:
             index = 2 * (place.x + row * place.y + column) + half
-            return mi.Vector4f(dr.gather(quadruple, self.texels, index, valid))
+            return mi.Vector4f(dr.gather(QUADRUPLE, self.texels, index, valid))
 
         first, second = (
             dr.lerp(

@@ -6,6 +6,7 @@ is silent about files that are missing.
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -35,8 +36,6 @@ class Names:
 
 def load_obj(path: Path, resources: Resources) -> tuple[Any, dict[str, Surface]]:
     """trimesh's scene of an OBJ, and the surfaces of its materials by name."""
-    import io
-
     import trimesh
 
     text = path.read_bytes().decode("utf-8", "replace")
@@ -61,8 +60,9 @@ def load_obj(path: Path, resources: Resources) -> tuple[Any, dict[str, Surface]]
         resources.note(f"its material {unknown[0]} is in no library: it is grey")
     if not listed:
         text = f"mtllib none\n{text}"  # else trimesh forgets which material is where
+    library: Any = Names(used)
     loaded = trimesh.load_scene(
-        io.BytesIO(text.encode()), file_type="obj", resolver=Names(used), process=False
+        io.BytesIO(text.encode()), file_type="obj", resolver=library, process=False
     )
     return loaded, surfaces
 
