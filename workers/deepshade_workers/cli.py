@@ -13,6 +13,7 @@ import typer
 
 if TYPE_CHECKING:
     from deepshade_workers.environments import EnvironmentLight
+    from deepshade_workers.scenes.scene import Scene
     from deepshade_workers.view import Light
 
 Vector = tuple[float, float, float]
@@ -29,8 +30,13 @@ def render(
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="EXR file to write.")],
-    eye: Annotated[Vector, typer.Option(help="The camera's place, scene units.")],
-    target: Annotated[Vector, typer.Option(help="What it looks at.")],
+    eye: Annotated[
+        Vector | None,
+        typer.Option(help="The camera's place, scene units.  [default: where most is seen from]"),
+    ] = None,
+    target: Annotated[
+        Vector | None, typer.Option(help="What it looks at.  [default: the scene's middle]")
+    ] = None,
     up: Annotated[Vector, typer.Option(help="Upward direction.")] = (0.0, 1.0, 0.0),
     fov: Annotated[float, typer.Option(help="Full horizontal angle, degrees.")] = 50.0,
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "768x512",
@@ -80,7 +86,9 @@ def render(
 ) -> None:
     """Render a view: every canonical attribute, the camera, and the references of EFFECTS.
 
-    Example:
+    Without --eye the camera is where most of the scene is seen from; it is printed. Examples:
+
+      deepshade render teapot.obj -o out.exr
 
       deepshade render teapot.obj -o out.exr --eye 0 3 6 --target 0 1 0 --radius 0.5
 
@@ -98,6 +106,7 @@ def render(
     from deepshade_workers.references import layer_of, require
     from deepshade_workers.render import render as render_view
     from deepshade_workers.scenes.loading import open_scene
+    from deepshade_workers.scenes.summary import warn
     from deepshade_workers.view import View
 
     if radius is not None and not (math.isfinite(radius) and radius > 0):
@@ -112,8 +121,10 @@ def render(
         if name not in ATTRIBUTES:
             raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called {name!r}")
     width, height = _size(size)
-    camera = Camera.look_at(eye, target, up, fov, width, height)
     opened = open_scene(scene)
+    warn(opened.notes)
+    eye, target = _placed(opened, eye, target, fov, width, height)
+    camera = Camera.look_at(eye, target, up, fov, width, height)
     view = View(
         camera,
         radius=opened.diagonal / 20 if radius is None else radius,
@@ -138,6 +149,30 @@ def render(
             f"  {name}: mean {found['mean']}, contrast {found['contrast']}, "
             f"standard error {found['error']}"
         )
+
+
+def _placed(
+    scene: Scene, eye: Vector | None, target: Vector | None, fov: float, width: int, height: int
+) -> tuple[Vector, Vector]:
+    """Eye and target as given, or of a view that is chosen, and said on standard error."""
+    from deepshade.errors import ConfigError
+    from deepshade_workers.framing import frame
+
+    if eye is not None:
+        if target is None:
+            x, y, z = (float(value) for value in scene.bounds.mean(0))
+            target = (x, y, z)
+        return eye, target
+    if target is not None:
+        raise ConfigError("eye", detail="--target needs --eye; without both a view is chosen")
+    found = frame(scene, fov, width, height)
+    places = (" ".join(f"{value:g}" for value in end) for end in (found.eye, found.target))
+    typer.echo(
+        f"seen from {found.place}: --eye {' --target '.join(places)}  "
+        f"(surfaces in {found.seen:.0%} of the scene's cells are in view)",
+        err=True,
+    )
+    return found.eye, found.target
 
 
 def _motion(text: str) -> tuple[str, Vector]:
@@ -274,6 +309,8 @@ def datagen(
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
     from deepshade_workers.datagen import DataSpec, default_shard_size, expand_scenes, generate
+    from deepshade_workers.scenes.loading import notes_of
+    from deepshade_workers.scenes.summary import warn
 
     spec = DataSpec(
         scenes=expand_scenes(scenes),
@@ -294,6 +331,7 @@ def datagen(
         skies=skies,
         layers=tuple(_listed(layers)),
     )
+    warn(notes_of(spec.scenes))
     begun = time.monotonic()
     done, fresh = _watched(generate(spec, out, address=address), hidden=as_json)
     seconds = time.monotonic() - begun
