@@ -94,6 +94,9 @@ def test_schema_and_pages(client):
         "format",
         "compression",
         "half",
+        "append",
+        "layer",
+        "multiply",
     }
     assert names == wanted
     assert {"image/x-exr", "multipart/form-data"} <= set(post["requestBody"]["content"])

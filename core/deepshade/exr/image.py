@@ -167,7 +167,8 @@ def write(
                 return
             body = io.BytesIO()
             file.write(body)
-        stream.writelines(exrencode.with_entries(body.getbuffer(), entries))
+        for part in exrencode.with_entries(body.getbuffer(), entries):
+            stream.write(part)
 
     if isinstance(target, (str, os.PathLike)):
         with replacing(Path(target)) as temporary, temporary.open("wb") as stream:
