@@ -145,6 +145,8 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
 
 def _said(error: Mapping[str, Any]) -> str:
     """What is wrong, where a bound is missed in as few digits as say it."""
+    if error["type"] == "extra_forbidden":
+        return "there is no such parameter"
     context = error.get("ctx", {})
     for bound, word in (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below")):
         if isinstance(context.get(bound), int | float):

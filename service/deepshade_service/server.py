@@ -16,7 +16,7 @@ from deepshade_service.app import Service
 
 
 class Server(uvicorn.Server):
-    """At the first signal requests that wait for a network are refused, and the others finish.
+    """At a signal requests are finished; at Ctrl-C those that wait for a network are refused.
 
     A second Ctrl-C ends the process at once.
     """
@@ -34,11 +34,11 @@ class Server(uvicorn.Server):
         _end(0)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """As uvicorn's, and a service that loads stops loading."""
+        """As uvicorn's, and at Ctrl-C nobody waits for what loads."""
         super().handle_exit(sig, frame)
         if self.force_exit:
             _end(128 + signal.SIGINT)
-        if self._loop is not None:
+        if sig == signal.SIGINT and self._loop is not None:
             self._loop.call_soon_threadsafe(self._service.stopping.set)
 
 

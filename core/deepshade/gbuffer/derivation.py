@@ -24,7 +24,7 @@ _PIECE = 2**13  # pixels transformed at a time
 
 _REQUIREMENTS: dict[Requirement, str] = {
     "fov": "the field of view (--fov)",
-    "matrix": "the camera's matrix (--world-to-camera)",
+    "matrix": "the camera's matrix (worldToCamera)",
     "lens": "the field of view and the lens (deepshade:focus and deepshade:aperture)",
 }
 REQUIREMENT_FIXES: dict[Requirement, str] = {
