@@ -20,6 +20,13 @@ ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for what takes long to make; the workers of pytest-xdist share it."""
+    base = tmp_path_factory.getbasetemp()
+    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "made-once"
+
+
+@pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of real meshes and images beside the project; skips where it is absent."""
     folder = ROOT.parent / "shared"

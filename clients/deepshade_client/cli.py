@@ -10,15 +10,14 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from deepshade.cli import run
+from deepshade.cli import CONTEXT, Version, run
 from deepshade_client.exceptions import NotReady, TransportError
 from deepshade_client.settings import DEFAULT_SERVER
 
 app = typer.Typer(
-    help="Shade G-buffers through a running deepshade service.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    context_settings=CONTEXT,
 )
 
 Server = Annotated[
@@ -29,6 +28,14 @@ EXIT_CODES = (
     "3 the service can't be reached or isn't ready, 130 interrupted (Ctrl-C)."
 )
 AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output on stdout.")]
+
+
+@app.callback()
+def root(show_version: Version = False) -> None:
+    """Shade G-buffers through a running deepshade service.
+
+    Example: deepshade-client shade ao renders/*.exr -o shaded/ --radius 0.5
+    """
 
 
 @app.command(epilog=EXIT_CODES)
@@ -127,7 +134,16 @@ def shade(
     server: Server = DEFAULT_SERVER,
     as_json: AsJson = False,
 ) -> None:
-    """Shade pictures and save the answers; or, with --explain, say how that would be done."""
+    """Shade pictures and save the answers; or, with --explain, say how that would be done.
+
+    Examples:
+
+      deepshade-client shade ao renders/*.exr -o shaded/ --radius 0.5
+
+      deepshade-client shade ao,gi,dof room.exr -o room-shaded.exr --focus 3 --aperture 0.1
+
+      deepshade-client shade ao shot.exr --explain
+    """
     from deepshade.gbuffer.channels import parse_mapping
     from deepshade_client import batch, report
     from deepshade_client.client import AsyncClient, Client
@@ -205,7 +221,10 @@ def shade(
 
 @app.command()
 def effects(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
-    """List the effects: their inputs, their settings with ranges, and the service's bundles."""
+    """List the effects: their inputs, their settings with ranges, and the service's bundles.
+
+    Example: deepshade-client effects --server http://farm:8000
+    """
     from deepshade_client.report import print_effects
 
     found = _effects(server)
@@ -221,7 +240,10 @@ def environments(
     server: Server = DEFAULT_SERVER,
     as_json: AsJson = False,
 ) -> None:
-    """List the environment maps of the service, and add some where it allows that."""
+    """List the environment maps of the service, and add some where it allows that.
+
+    Example: deepshade-client environments --add studio.hdr
+    """
     from deepshade_client.client import Client
     from deepshade_client.report import print_environments
     from deepshade_client.settings import Retry
@@ -235,7 +257,10 @@ def environments(
 
 @app.command()
 def models(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
-    """List the model bundles that the service has loaded."""
+    """List the model bundles that the service has loaded.
+
+    Example: deepshade-client models --json
+    """
     from deepshade_client.report import print_models
 
     found = [{"effect": e["name"], **bundle} for e in _effects(server) for bundle in e["bundles"]]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -210,10 +211,21 @@ def _entry(task: Task, result: Result | None) -> dict[str, Any]:
         return entry | {"error": {"detail": "not tried: the batch ended early"}}
     entry["seconds"] = round(result.seconds, 4)
     if saved := result.saved:
-        facts = {"facts": dict(saved.facts), "milliseconds": dict(saved.timing)}
-        return entry | {"ok": True} | facts
+        facts = {name: number(name, fact) for name, fact in saved.facts.items()}
+        return entry | {"ok": True, "facts": facts, "milliseconds": dict(saved.timing)}
     if result.error is None:
         return entry | {"ok": True, "skipped": True}
     error = result.error
     document = error.document if isinstance(error, ServerProblem) else {"detail": str(error)}
     return entry | {"error": document}
+
+
+def number(name: str, fact: str) -> str | int | float:
+    """A header's number as one; names and hashes stay text, whatever they look like."""
+    if name.endswith(("bundle", "environment", "sha256")):
+        return fact
+    for kind in (int, float):
+        with suppress(ValueError):
+            if math.isfinite(number := kind(fact)):
+                return number
+    return fact

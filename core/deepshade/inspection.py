@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,9 +18,13 @@ if TYPE_CHECKING:
     from deepshade.exr import Limits
     from deepshade.gbuffer.plan import Plan
 
+SCENE_SUFFIXES = {".obj", ".ply", ".gltf", ".glb", ".stl", ".off", ".xml"}
+
 
 def inspect(
-    files: Annotated[list[Path], typer.Argument(help="EXR files of one view.")],
+    files: Annotated[
+        list[Path], typer.Argument(help="EXR files of one view, or scenes (GLB, glTF, OBJ, PLY …).")
+    ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
     map_: Annotated[
         list[str] | None,
@@ -34,10 +39,25 @@ def inspect(
         typer.Option(help="The camera's matrix: 16 numbers, row by row, for column vectors."),
     ] = None,
 ) -> None:
-    """Show what EXR files hold, what it maps to, and what each effect still needs."""
+    """Show what EXR files hold, what it maps to, and what each effect still needs.
+
+    Of a scene: its box, units, objects, triangles, materials, and what is missing.
+
+    Examples:
+
+      deepshade inspect shot.exr
+
+      deepshade inspect shot_normal.exr shot_depth.exr --map normal=MyLayer.N --fov 40
+
+      deepshade inspect scene.glb
+    """
     from deepshade.camera import parse_matrix
     from deepshade.gbuffer.channels import parse_mapping
 
+    if any(file.suffix.lower() in SCENE_SUFFIXES for file in files):
+        # By name, for the core imports no other part; without the extra, run() says so.
+        import_module("deepshade_workers.scenes.summary").inspect(files, as_json=json)
+        return
     matrix = parse_matrix(world_to_camera) if world_to_camera else None
     report = inspect_files(
         files, mapping=parse_mapping(map_ or ()), profile=profile, fov=fov, matrix=matrix

@@ -21,10 +21,11 @@ def serve(
     host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 8000,
     models: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
-            help="Folder of bundles, <effect>/<name>/. Default: $DEEPSHADE_MODELS, ./models, or"
-            " the models that came with the sources."
+            help="Folder of bundles, <effect>/<name>/, or 'shipped' for those that come with"
+            " deepshade; repeatable, the first that has a bundle counts. Default:"
+            " $DEEPSHADE_MODELS, else 'shipped'."
         ),
     ] = None,
     environments: Annotated[
@@ -69,21 +70,26 @@ def serve(
         LogLevel, typer.Option(case_sensitive=False, help="The least that is logged.")
     ] = "info",
 ) -> None:
-    """Serve the shaders over HTTP."""
+    """Serve the shaders over HTTP.
+
+    Examples:
+
+      deepshade serve
+
+      deepshade serve --port 9000 --models models --models shipped --environments maps
+    """
     from dataclasses import replace
 
-    from deepshade.bundles import bundle_root
+    from deepshade.bundles import bundle_roots, overlooked
     from deepshade.errors import ConfigError
     from deepshade.machine import cpu_count
     from deepshade_service.config import Settings, default_limits, default_memory
     from deepshade_service.memory import parse_size
     from deepshade_service.models import check_backend
 
-    models = models or bundle_root()
-    if not models.is_dir():
-        raise ConfigError(
-            "models", detail=f"there is no folder {models}; --models says where the bundles are"
-        )
+    roots = bundle_roots(models or ())
+    if note := overlooked(roots):
+        typer.echo(note, err=True)
     if environments is not None and not environments.is_dir():
         raise ConfigError("environments", detail=f"there is no folder {environments}")
     if engine or precision:
@@ -97,7 +103,7 @@ def serve(
     }
     uploads = parse_size(max_uploads) if max_uploads else 0
     settings = Settings(
-        models=models,
+        models=roots,
         environments=environments,
         environment_uploads=environment_uploads,
         engine=engine,

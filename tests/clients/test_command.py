@@ -12,7 +12,7 @@ import time
 import pytest
 
 from deepshade import exr
-from deepshade_client import batch
+from deepshade_client import batch, report
 from deepshade_client.batch import UsageError, plan
 from deepshade_client.cli import main
 
@@ -124,15 +124,40 @@ def test_shade_one(run, views, tmp_path):
 def test_shade_a_folder_as_json(run, views, tmp_path):
     out, err = run("shade", "ao", views, "-o", tmp_path / "out", "--json", "--float", "-j", "2")
     assert err == ""
-    report = json.loads(out)
-    assert (report["saved"], report["failed"]) == (3, 0)
-    for entry, width in zip(report["pictures"], (4, 5, 6), strict=True):
+    document = json.loads(out)
+    assert (document["saved"], document["failed"]) == (3, 0)
+    for entry, width in zip(document["pictures"], (4, 5, 6), strict=True):
         assert entry["ok"]
         assert entry["facts"]["bundle"] == "tiny"
+        assert isinstance(entry["facts"]["radius"], float)
+        assert entry["facts"]["background_pixels"] == 0
+        assert isinstance(entry["facts"]["bundle_sha256"], str)
         assert set(entry["milliseconds"]) == {"decode", "plan", "infer", "encode"}
         part = exr.read_header(entry["output"]).parts[0]
         assert part.shape == (4, width)
         assert part.channels == {"Y": "float"}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fact"),
+    [
+        ("tiles", "12", 12),
+        ("gi.radius", "1e-05", 1e-5),
+        ("bundle_sha256", "123456789012", "123456789012"),
+        ("ao.bundle", "7", "7"),
+        ("environment", "2024", "2024"),
+        ("dssim", "nan", "nan"),
+        ("derived", "position from depth", "position from depth"),
+    ],
+)
+def test_numbers_in_json_are_numbers_and_names_stay_names(name, text, fact):
+    assert report.number(name, text) == fact
+
+
+def test_every_help_has_an_example_and_every_command_a_version(run):
+    for name in ("shade", "effects", "environments", "models"):
+        assert f"deepshade-client {name} " in " ".join(run(name, "--help")[0].split())
+        assert run(name, "--version")[0].startswith("deepshade 0.")
 
 
 def test_explain_prints_the_plan_and_saves_nothing(run, views):
@@ -255,9 +280,9 @@ def test_together(run, make_exr, make_picture, tmp_path):
 def test_one_bad_picture_does_not_stop_the_others(run, views, tmp_path):
     (views / "b.exr").write_bytes(b"hello")
     out, err = run("shade", "ao", views, "-o", tmp_path / "out", "--json", code=1)
-    report = json.loads(out)
-    assert [entry["ok"] for entry in report["pictures"]] == [True, False, True]
-    assert report["pictures"][1]["error"]["status"] == 400
+    document = json.loads(out)
+    assert [entry["ok"] for entry in document["pictures"]] == [True, False, True]
+    assert document["pictures"][1]["error"]["status"] == 400
     assert "not an OpenEXR image" in err
     assert not (tmp_path / "out" / "b.exr").exists()
 

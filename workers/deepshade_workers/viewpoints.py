@@ -14,7 +14,7 @@ from deepshade_workers.drawing import dress
 from deepshade_workers.references import ao
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, trace
-from deepshade_workers.view import Limits, Vector, View
+from deepshade_workers.view import MIN_CONTRAST, Limits, Vector, View
 
 FOV = 50.0
 PROBE = 48
@@ -32,7 +32,7 @@ def sample_view(
     frame: int,
     size: int,
     radius: float | None = None,
-    min_contrast: float = 0.06,
+    min_contrast: float = MIN_CONTRAST,
     displacements: Mapping[str, Vector] | None = None,
     limits: Limits | None = None,
 ) -> View:
