@@ -196,7 +196,7 @@ def _print_error(console: Console, result: Result) -> None:
 
 
 def _print_failure(console: Console, mark: str, text: str, error: Exception) -> None:
-    console.print(f"{mark} {escape(text)}", highlight=False, soft_wrap=True)
+    console.print(f"{mark} {escape(as_options(text))}", highlight=False, soft_wrap=True)
     if fix := getattr(error, "fix", ""):
         console.print(f"    {escape(as_options(fix))}", highlight=False, soft_wrap=True)
 

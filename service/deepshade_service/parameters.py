@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Literal
@@ -168,7 +169,6 @@ class ShadeParameters(BaseModel):
         str | None,
         Field(
             max_length=100,
-            pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.:-]*$",
             description="The name of the answer's layer, as `AO`; with `append` else the effect's.",
         ),
     ] = None
@@ -179,6 +179,15 @@ class ShadeParameters(BaseModel):
             " `map=beauty=…` says where it is, else its name (`Combined`, `rgba`, …) or R G B."
         ),
     ] = False
+
+    @field_validator("layer")
+    @classmethod
+    def _check_layer(cls, name: str | None) -> str | None:
+        if name is not None and not re.fullmatch(r"\w[\w.:-]*", name, re.ASCII):
+            raise ValueError(
+                f"'{name}' is no layer's name: letters, digits, _ . : and - may be in it"
+            )
+        return name
 
     @field_validator("map")
     @classmethod

@@ -151,7 +151,7 @@ def _said(error: Mapping[str, Any]) -> str:
     for bound, word in (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below")):
         if isinstance(context.get(bound), int | float):
             return f"must be {word} {context[bound]:g}, not {str(error.get('input'))[:40]}"
-    return str(error["msg"])
+    return str(error["msg"]).removeprefix("Value error, ")
 
 
 def _fix(error: Mapping[str, Any], parameters: Collection[str]) -> str:

@@ -168,7 +168,8 @@ def test_parts_and_what_no_answer_can_hold(client, shot):
     ("effect", "query", "said"),
     [
         ("ao", "append=1&format=png", "a PNG has no layers"),
-        ("ao", "layer=a%0Ab", "layer"),
+        ("ao", "layer=a%0Ab", "no layer's name"),
+        ("ao", "layer=", "no layer's name"),
     ],
 )
 def test_refused(client, shot, effect, query, said):
