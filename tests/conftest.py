@@ -13,6 +13,10 @@ import pytest
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Each worker of pytest-xdist has a core: its threads would only wait for each other's.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # No test may fill, or depend on, what this machine's services keep.
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="deepshade-tests-")
 

@@ -89,10 +89,8 @@ def _what(extra: str) -> str:
         return f"-e '{'.' if clone == Path.cwd() else clone}{suffix}'"
     url = _origin()
     place = Path(url2pathname(urlsplit(url).path))
-    if url.startswith("file:") and place.is_dir():
+    if url.startswith("file:") and place.exists():
         return f"'{place}{suffix}'"
-    if url.startswith("file:") and place.is_file():
-        return f"'deepshade{suffix} @ {url}'"
     wanted = _requirements()[extra]
     return " ".join(f"'{wanted[name]}'" for name in missing_packages(extra) or wanted)
 
