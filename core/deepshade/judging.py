@@ -90,7 +90,7 @@ def nothing_shown(effect: Effect, where: str, least: float) -> DataError:
         measure = "trivial answer has a DSSIM"
         fix = "other scenes, or more --views"
     return DataError(
-        f"no view of {where} counts: of none the {measure} of at least {least:g}",
+        f"no view of {where} has enough contrast: of none the {measure} of {least:g} or more",
         fix=f"render views that show more: {fix}, or see 'deepshade evaluate --min-contrast'",
     )
 
