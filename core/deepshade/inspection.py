@@ -144,10 +144,10 @@ def _installed() -> dict[str, dict[str, list[str]]]:
     """The inputs of every bundle here, unverified: effect -> bundle -> attributes."""
     import json
 
-    from deepshade.bundles import CONFIG, bundle_folders, bundle_root
+    from deepshade.bundles import CONFIG, bundle_folders, bundle_roots
 
     found: dict[str, dict[str, list[str]]] = {}
-    for folder in bundle_folders(bundle_root()):
+    for folder in bundle_folders(*bundle_roots()):
         with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged one is none
             config = json.loads((folder / CONFIG).read_text("utf-8"))
             found.setdefault(config["effect"], {})[folder.name] = config["inputs"]
