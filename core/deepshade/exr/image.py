@@ -167,8 +167,8 @@ def write(
                 return
             body = io.BytesIO()
             file.write(body)
-        for piece in exrencode.with_entries(body.getbuffer(), entries):
-            stream.write(piece)
+        for each in exrencode.with_entries(body.getbuffer(), entries):
+            stream.write(each)
 
     if isinstance(target, (str, os.PathLike)):
         with replacing(Path(target)) as temporary, temporary.open("wb") as stream:
