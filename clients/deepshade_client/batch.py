@@ -7,8 +7,8 @@ import glob
 import os
 import re
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from deepshade import exr
@@ -18,7 +18,7 @@ from deepshade_client.answer import Saved
 from deepshade_client.client import AsyncClient
 from deepshade_client.exceptions import ClientError, ConnectionFailed
 from deepshade_client.request import Options
-from deepshade_client.sequences import View
+from deepshade_client.sequences import View, sequence_of
 
 SUFFIXES = (".exr", ".png")
 
@@ -31,12 +31,13 @@ class UsageError(ClientError):
 class Task:
     """One view (one file, or several that belong together) and where its answer goes.
 
-    It isn't sent where it `lacks` files that the other frames of its sequence have.
+    It isn't sent where it `lacks` files that the other frames of its `sequence` have.
     """
 
     sources: tuple[Path, ...]
     target: Path
     lacks: tuple[str, ...] = ()
+    sequence: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,10 @@ def plan(
         targets = [Path(out, view.folder, view.name + suffix) for view in found]
     else:
         targets = [Path(out)]
-    tasks = [Task(v.files, target, v.lacks) for v, target in zip(found, targets, strict=True)]
+    tasks = [
+        Task(v.files, target, v.lacks, sequence_of(v.files) if v.frame is not None else None)
+        for v, target in zip(found, targets, strict=True)
+    ]
     _check_targets(tasks, set(files))
     return tasks
 
@@ -144,31 +148,46 @@ async def run(
     """Shade all tasks, `jobs` at a time, and save their answers; `done` hears of each.
 
     Errors become results. When nothing answers at the server's address, what hasn't started
-    isn't tried. With `skip` what `is_done` is left as it is.
+    isn't tried. With `skip` what `is_done` is left as it is. Frames of a sequence are shaded at the
+    radius of its first one, unless one is named: else it would follow each one's depth and flicker.
     """
     queue = iter(tasks)
     results: list[Result] = []
     unreachable = False
+    radii: dict[Path, asyncio.Future[str | None]] = {}
 
     async def work() -> None:
         nonlocal unreachable
         for task in queue:
             if unreachable:
                 return
+            settings, first = options, None
+            if task.sequence and options.radius is None:
+                if known := radii.get(task.sequence):
+                    settings = replace(options, radius=await known)
+                else:
+                    first = radii[task.sequence] = asyncio.get_running_loop().create_future()
             start = time.perf_counter()
             saved: Saved | None = None
             failure: Exception | None = None
+            radius: str | None = None
             try:
                 if task.lacks:
                     raise _lacking(task)
-                if not (skip and await asyncio.to_thread(is_done, task)):
+                if skip and await asyncio.to_thread(is_done, task):
+                    radius = await asyncio.to_thread(_radius_of, task.target) if first else None
+                else:
                     picture = picture_of(task.sources)
-                    saved = await client.shade_to(task.target, effect, picture, options)
+                    saved = await client.shade_to(task.target, effect, picture, settings)
+                    radius = _radius_among(saved.facts, ".")
             except (ClientError, OSError) as error:
                 # its traceback and its cause hold the request, with the picture in it
                 failure = error.with_traceback(None)
                 failure.__cause__ = failure.__context__ = None
                 unreachable |= isinstance(error, ConnectionFailed)
+            finally:
+                if first:
+                    first.set_result(radius)
             result = Result(task, time.perf_counter() - start, saved, failure)
             results.append(result)
             done(result)
@@ -177,6 +196,19 @@ async def run(
         for _ in range(min(jobs, len(tasks))):
             group.create_task(work())
     return results
+
+
+def _radius_of(answer: Path) -> str | None:
+    """That which a saved answer names."""
+    if answer.suffix.lower() != ".exr":
+        return None
+    return _radius_among(exr.read_header(answer).parts[0].attributes, ":")
+
+
+def _radius_among(facts: Mapping[str, object], between: str) -> str | None:
+    """That of one effect, or of the first of several, if it followed from depth."""
+    names = (name for name in facts if name.split(between)[-1] == "radius")
+    return next((str(facts[k]) for k in names if facts.get(f"{k}_source") == "depth"), None)
 
 
 def _lacking(task: Task) -> UsageError:

@@ -91,7 +91,7 @@ def views(files: Mapping[Path, Path], *, together: bool | None = None) -> list[V
 
 def summary(frames: Iterable[Sequence[Path]]) -> list[str]:
     """A line for each sequence whose frames are several files: how many, and of what."""
-    kinds = Counter((_sequence(files), _attributes(files)) for files in frames if len(files) > 1)
+    kinds = Counter((sequence_of(files), _attributes(files)) for files in frames if len(files) > 1)
     return [
         f"{sequence.name}: {count} frame{'s' * (count > 1)}, {len(attributes)} files a frame: "
         + ", ".join(attributes)
@@ -108,7 +108,7 @@ def _view(group: Sequence[Path], files: Mapping[Path, Path]) -> View:
     return View(tuple(group), below.parent, label, frame)
 
 
-def _sequence(files: Sequence[Path]) -> Path:
+def sequence_of(files: Sequence[Path]) -> Path:
     """What the frames of a sequence have in common: their folder, and the name of the shot."""
     return files[0].parent / (parse_stem(files[0].stem).shot or "frames")
 
@@ -121,7 +121,7 @@ def _with_gaps(found: list[View]) -> list[View]:
     """The views; one that lacks an attribute that most frames of its sequence have says so."""
     sequences: dict[Path, list[View]] = {}
     for view in found:
-        sequences.setdefault(_sequence(view.files), []).append(view)
+        sequences.setdefault(sequence_of(view.files), []).append(view)
     usual: dict[Path, list[str]] = {}
     for sequence, frames in sequences.items():
         counts = Counter(word for view in frames for word in set(_attributes(view.files)))
@@ -130,6 +130,6 @@ def _with_gaps(found: list[View]) -> list[View]:
 
     def lacking(view: View) -> tuple[str, ...]:
         there = _attributes(view.files)
-        return tuple(word for word in usual[_sequence(view.files)] if word not in there)
+        return tuple(word for word in usual[sequence_of(view.files)] if word not in there)
 
     return [replace(view, lacks=lacking(view)) for view in found]

@@ -237,7 +237,7 @@ def test_what_is_done_is_skipped(run, frames, tmp_path):
     first, second, third = sorted((tmp_path / "out").iterdir())
     made = {path: path.stat().st_mtime_ns for path in (first, second, third)}
     first.write_bytes(first.read_bytes()[:-1])  # not whole
-    later = made[second] + 10**9
+    later = made[second] + 1
     os.utime(frames / "s_position.0002.exr", ns=(later, later))
     _, err = run(*arguments)
     assert "2 saved, 1 skipped" in err
@@ -247,6 +247,24 @@ def test_what_is_done_is_skipped(run, frames, tmp_path):
     _, err = run("shade", "ao", frames, "-o", f"{tmp_path}/png/", "--png")
     _, err = run("shade", "ao", frames, "-o", f"{tmp_path}/png/", "--png", "--skip-existing")
     assert "3 skipped" in err
+
+
+def test_a_sequence_has_one_radius(run, make_exr, make_picture, tmp_path):
+    for frame in (1, 2, 3):
+        picture = {name: frame * plane for name, plane in make_picture(4, 6).items()}
+        (tmp_path / f"s.{frame:04d}.exr").write_bytes(make_exr(picture))
+    out = tmp_path / "out.####.exr"
+
+    def radii(*options):
+        run("shade", "ao", tmp_path / "s.####.exr", "-o", out, *options)
+        headers = [exr.read_header(path) for path in sorted(tmp_path.glob("out.*"))]
+        return [header.parts[0].attributes["deepshade:radius"] for header in headers]
+
+    first = radii()[0]
+    assert radii() == [first] * 3
+    (tmp_path / "out.0003.exr").unlink()
+    assert radii("--skip-existing") == [first] * 3
+    assert len(set(radii("--radius", "15%"))) == 3
 
 
 def test_no_frame_number(run, views, tmp_path):
