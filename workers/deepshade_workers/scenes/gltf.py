@@ -134,6 +134,8 @@ def load_gltf(path: Path) -> Mesh:
     """
     document = _open(path)
     content = document.json
+    if not isinstance(content, dict):
+        raise ValueError("it is no glTF")
     version = str(content.get("asset", {}).get("version", "2.0"))
     if not version.startswith("2."):
         raise SceneError(f"{path} is glTF {version}", fix="only glTF 2 can be read: export it anew")
