@@ -148,12 +148,13 @@ async def run(
     """Shade all tasks, `jobs` at a time, and save their answers; `done` hears of each.
 
     Errors become results. When nothing answers at the server's address, what hasn't started
-    isn't tried. With `skip` what `is_done` is left as it is. Frames of a sequence are shaded at the
-    radius of its first one, unless one is named: else it would follow each one's depth and flicker.
+    isn't tried. With `skip` what `is_done` is left as it is. A radius that follows from depth is
+    that of a sequence's first frame in all of them: from frame to frame it would flicker.
     """
     queue = iter(tasks)
     results: list[Result] = []
     unreachable = False
+    follows = options.radius is None or str(options.radius).strip().endswith("%")
     radii: dict[Path, asyncio.Future[str | None]] = {}
 
     async def work() -> None:
@@ -162,9 +163,9 @@ async def run(
             if unreachable:
                 return
             settings, first = options, None
-            if task.sequence and options.radius is None:
+            if task.sequence and follows:
                 if known := radii.get(task.sequence):
-                    settings = replace(options, radius=await known)
+                    settings = replace(options, radius=await known or options.radius)
                 else:
                     first = radii[task.sequence] = asyncio.get_running_loop().create_future()
             start = time.perf_counter()
@@ -206,9 +207,10 @@ def _radius_of(answer: Path) -> str | None:
 
 
 def _radius_among(facts: Mapping[str, object], between: str) -> str | None:
-    """That of one effect, or of the first of several, if it followed from depth."""
+    """That of one effect, or of the first of several, if neither header nor bundle gave it."""
     names = (name for name in facts if name.split(between)[-1] == "radius")
-    return next((str(facts[k]) for k in names if facts.get(f"{k}_source") == "depth"), None)
+    known = (k for k in names if facts.get(f"{k}_source") in ("depth", "request"))
+    return next((str(facts[k]) for k in known), None)
 
 
 def _lacking(task: Task) -> UsageError:
