@@ -43,6 +43,11 @@ class Options:
     attribute, `half` asks for 16-bit pixels. `environment` names the map that lights the scene,
     `rotate` turns it, in degrees, and `up` is the world's up axis.
 
+    How the values are stored, where the service doesn't find it out: `axes` as in
+    "position:x,-y,-z" or "opencv", `normals`, the kind of `depth` with the `near` and `far` plane
+    where it needs them, and what to `derive` though it is there. `strict` makes warnings errors,
+    `trust` skips the checks.
+
     What shades: `quality` ("fast", "balanced", "best") or `bundle` by name; `max_error` (DSSIM)
     asks for the fastest within an error, `budget_ms` for the most accurate within a time of the
     network; `engine` ("openvino") and `precision` ("bf16") pin how it runs.
@@ -58,6 +63,14 @@ class Options:
     fov: float | None = None
     profile: str | None = None
     mapping: Mapping[str, str] | None = None
+    axes: Sequence[str] | None = None
+    normals: Literal["signed", "encoded", "scaled"] | None = None
+    depth: str | None = None
+    near: float | None = None
+    far: float | None = None
+    derive: Sequence[str] | None = None
+    strict: bool | None = None
+    trust: bool | None = None
     bundle: str | None = None
     quality: str | None = None
     max_error: float | None = None
@@ -70,8 +83,10 @@ class Options:
 
     def query(self) -> list[tuple[str, str]]:
         """As the parameters of the request."""
-        plain = asdict(replace(self, mapping=None))
+        plain = asdict(replace(self, mapping=None, axes=None, derive=None))
         mapped = [("map", f"{name}={where}") for name, where in (self.mapping or {}).items()]
+        mapped += [("axes", axes) for axes in self.axes or ()]
+        mapped += [("derive", name) for name in self.derive or ()]
         return [(name, _text(value)) for name, value in plain.items() if value is not None] + mapped
 
 

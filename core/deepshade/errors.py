@@ -89,7 +89,7 @@ class ContradictionError(DeepshadeError):
     """
 
     def __init__(self, detail: str, *, seen: str = "", fits: Sequence[str] = (), fix: str) -> None:
-        super().__init__(detail, fix=f"{fix}; or --trust true, if it is meant so")
+        super().__init__(detail, fix=f"{fix}; or --trust, if it is meant so")
         self.seen = seen or detail
         self.fits = tuple(fits)
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from deepshade.exr import Limits
+    from deepshade.gbuffer.conventions import Conventions
     from deepshade.gbuffer.plan import Plan
 
 
@@ -26,11 +27,30 @@ def inspect(
         str | None, typer.Option(help="The renderer whose names and conventions to use.")
     ] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    axes: Annotated[
+        list[str] | None,
+        typer.Option(help="Stored axes, as position:x,-y,-z or opencv; repeatable."),
+    ] = None,
+    normals: Annotated[
+        str | None, typer.Option(help="How normals are stored: signed, encoded or scaled.")
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="What is stored as depth: planar, distance, inverse, …")
+    ] = None,
+    near: Annotated[float | None, typer.Option(help="Depth of the near plane.")] = None,
+    far: Annotated[float | None, typer.Option(help="Depth of the far plane.")] = None,
 ) -> None:
     """Show what EXR files hold, what it maps to, and what each effect still needs."""
     from deepshade.gbuffer.channels import parse_mapping
+    from deepshade.gbuffer.conventions import parse_conventions
 
-    report = inspect_files(files, mapping=parse_mapping(map_ or ()), profile=profile, fov=fov)
+    report = inspect_files(
+        files,
+        mapping=parse_mapping(map_ or ()),
+        profile=profile,
+        fov=fov,
+        conventions=parse_conventions(axes or (), normals, depth, near, far),
+    )
     if json:
         import json as json_module
 
@@ -48,11 +68,13 @@ def inspect_files(
     profile: str | None = None,
     fov: float | None = None,
     limits: Limits | None = None,
+    conventions: Conventions | None = None,
 ) -> dict[str, Any]:
     """The report on files of one view, as plain JSON values.
 
     Keys: files (parts, channels, windows), profile, camera, mapped, ambiguous, effects (for each:
-    ready, have, derived, missing) and statistics. Raises what `load_gbuffer` raises for files
+    ready, have, derived, missing), statistics, and checks (derived, warnings, and the contradiction
+    with its fix, if there is one). Raises what `load_gbuffer` raises for files
     that can't be read, but not for missing or ambiguous attributes: those are the report.
     """
     from deepshade import exr
@@ -77,6 +99,16 @@ def inspect_files(
         "ambiguous": {name: list(e.candidates) for name, e in plan.ambiguous.items()},
         "effects": {name: _effect(plan, effect.inputs) for name, effect in EFFECTS.items()},
         "statistics": _statistics(plan, bodies, limits),
+        "checks": _checks(
+            plan,
+            list(zip([path.name for path in paths], bodies, strict=True)),
+            profile=profile,
+            mapping=mapping,
+            fov=fov,
+            limits=limits,
+            headers=headers,
+            conventions=conventions,
+        ),
     }
 
 
@@ -121,6 +153,24 @@ def _effect(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
             if not steps:
                 have.append(name)
     return {"ready": not missing, "have": have, "derived": derived, "missing": missing}
+
+
+def _checks(plan: Plan, sources: Sequence[tuple[str, bytes]], **how: Any) -> dict[str, Any]:
+    """What the geometry says of itself, as when it is shaded."""
+    from deepshade.errors import ContradictionError, DeepshadeError
+    from deepshade.gbuffer import load_gbuffer
+
+    needs = [name for name in ("normal", "position", "depth") if plan.steps(name) is not None]
+    found: dict[str, Any] = {"derived": {}, "warnings": [], "contradiction": None}
+    try:
+        if needs:
+            gbuffer = load_gbuffer(sources, needs, **how)
+            found |= {"derived": gbuffer.derived, "warnings": list(gbuffer.warnings)}
+    except ContradictionError as error:
+        found["contradiction"] = {"detail": str(error), "fix": error.fix}
+    except DeepshadeError as error:
+        found["warnings"] = [str(error)]
+    return found
 
 
 def _statistics(plan: Plan, bodies: Sequence[bytes], limits: Limits) -> dict[str, Any]:
@@ -190,6 +240,15 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
     for name, candidates in report["ambiguous"].items():
         table.add_row(name, f"[yellow]ambiguous:[/yellow] {_safe(', '.join(candidates))}")
     console.print(table)
+
+    checks = report["checks"]
+    for name, how in checks["derived"].items():
+        console.print(f"{name}: {_safe(how)}")
+    for warning in checks["warnings"]:
+        console.print(f"[yellow]warning:[/yellow] {_safe(warning)}")
+    if checks["contradiction"]:
+        console.print(f"[red]contradiction:[/red] {_safe(checks['contradiction']['detail'])}")
+        console.print(f"  fix: {_safe(checks['contradiction']['fix'])}")
 
     table = Table("effect", "state", "derived", "missing")
     for name, effect in report["effects"].items():

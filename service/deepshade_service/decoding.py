@@ -57,7 +57,8 @@ def decode(
         fov=asked.fov,
         limits=limits,
         headers=headers,
-        anew=("focal",) if new_lens else (),
+        anew=(*(name.value for name in asked.derive), *(("focal",) if new_lens else ())),
+        conventions=asked.conventions,
     )
     try:
         for bundle, gbuffer in zip(bundles, gbuffers, strict=True):

@@ -86,6 +86,8 @@ def explain(
         "precision": selection.backend.precision,
         "dssim": bundle.dssim,
         **_settings(gbuffer, bundle.effect, plan),
+        "derived": gbuffer.derived,
+        "warnings": list(gbuffer.warnings),
         "pixels": {
             "width": width,
             "height": height,
@@ -117,6 +119,7 @@ def facts_of(gbuffer: GBuffer, plan: ShadePlan, made: Json) -> Facts:
         "nonfinite_pixels": int(gbuffer.nonfinite),
         "computed_pixels": plan.computed,
         "tiles": len(plan.tiles),
+        **({"warnings": "; ".join(made["warnings"])} if made["warnings"] else {}),
     }
 
 

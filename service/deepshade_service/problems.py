@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Collection, Mapping
 from http import HTTPStatus
 from typing import Any
@@ -27,6 +28,10 @@ _OPTIONS = {
     "files": "--max-files",
     "memory_bytes": "--memory",
 }
+
+
+# Advice of the core package names options of commands: here they are parameters.
+_FLAG, _OPTION = re.compile(r"--(strict|trust)\b"), re.compile(r"--([a-z_]+) (<[^>]*>|\S+[^\s,;.])")
 
 
 class Problem(Exception):
@@ -59,6 +64,7 @@ def from_error(error: DeepshadeError) -> Problem:
     if isinstance(error, LimitError) and error.limit in _OPTIONS:
         option = _OPTIONS[error.limit]
         fix = f"send a smaller picture, or start the service with a higher {option}"
+    fix = _OPTION.sub(r"?\1=\2", _FLAG.sub(r"?\1=1", fix))
     return Problem(status, kind, str(error), fix=fix, **facts_of(error))
 
 

@@ -232,7 +232,7 @@ class _Examination:
             f"{seen}: {side:.0%} lie behind it" if side > _FEW else seen,
             seen=seen,
             fix="if they are in world space, say so and where the camera is: "
-            "--map position_world=<layer> --world_to_camera <16 numbers>",
+            "--map position_world=<layer> and --world_to_camera <16 numbers>",
         )
 
     def _field_of_view(self, found: tuple[float, float]) -> None:
@@ -353,7 +353,7 @@ class _Examination:
         ]
         if alike:
             options = [
-                " ".join(_option(name, other, source, which, kind, self.reading(name).axes))
+                " and ".join(_option(name, other, source, which, kind, self.reading(name).axes))
                 for _, other, which in [equals[0], *alike[:2]]
             ]
             raise ContradictionError(

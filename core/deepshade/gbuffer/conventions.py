@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from deepshade.camera import Camera
 from deepshade.errors import ConfigError
 from deepshade.gbuffer.axes import AS_STORED, Axes
-from deepshade.gbuffer.depths import Kind, check_planes, planar
+from deepshade.gbuffer.depths import KINDS, Kind, check_planes, planar
 
 Encoding = Literal["signed", "encoded", "scaled"]
 ENCODINGS: tuple[Encoding, ...] = get_args(Encoding)
@@ -106,6 +106,23 @@ def parse_axes(entries: Iterable[str]) -> dict[str, Axes]:
                 raise ConfigError(each, detail=f"the axes of '{each}' are given twice")
             found[each] = Axes.parse(text)
     return found
+
+
+def parse_conventions(
+    axes: Iterable[str],
+    normals: str | None,
+    depth: str | None,
+    near: float | None = None,
+    far: float | None = None,
+    checks: Checks = "usual",
+) -> Conventions:
+    """From texts, as commands and requests have them. Raises ConfigError."""
+    for name, value, known in (("normals", normals, ENCODINGS), ("depth", depth, KINDS)):
+        if value is not None and value not in known:
+            raise ConfigError(
+                value, known, detail=f"{name} can be {', '.join(known)}, not '{value:.60}'"
+            )
+    return Conventions(parse_axes(axes), normals, depth, near, far, checks)  # type: ignore[arg-type]
 
 
 def apply(readings: Mapping[str, Reading], arrays: dict[str, Float], camera: Camera | None) -> None:

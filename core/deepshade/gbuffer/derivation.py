@@ -28,7 +28,7 @@ _REQUIREMENTS: dict[Requirement, str] = {
     "lens": "the field of view and the lens (deepshade:focus and deepshade:aperture)",
 }
 REQUIREMENT_FIXES: dict[Requirement, str] = {
-    "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov",
+    "fov": "give the full horizontal angle in degrees (--fov <degrees>), or write deepshade:fov",
     "matrix": "write the standard header attribute worldToCamera (M44f)",
     "lens": "give the full horizontal angle, the focus distance and the aperture's diameter, or "
     "write deepshade:fov, deepshade:focus and deepshade:aperture",
