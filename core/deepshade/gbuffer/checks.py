@@ -43,6 +43,10 @@ class Verdict:
     notes: dict[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
+    def note(self, name: str, text: str) -> None:
+        """Says something of a quantity, behind what was said before."""
+        self.notes[name] = f"{self.notes[name]}; {text}" if name in self.notes else text
+
 
 def examine(
     arrays: Mapping[str, NDArray[np.float32]],
@@ -125,8 +129,7 @@ class _Examination:
     def read(self, name: str, note: str, **changed: Any) -> None:
         """Read `name` so from now on, and say it."""
         self.verdict.readings[name] = replace(self.reading(name), **changed)
-        before = self.verdict.notes.get(name)
-        self.verdict.notes[name] = f"{before}; {note}" if before else note
+        self.verdict.note(name, note)
 
     def warn(self, text: str) -> None:
         self.verdict.warnings.append(text)
@@ -195,7 +198,7 @@ class _Examination:
         points = stored[:, shown]
         found = projection((asked or AS_STORED).of(points), columns, rows)
         if found is not None:
-            self._field_of_view(found)
+            self._field_of_view(found[0][0])
             return
         fitting = [axes for axes in EVERY if projection(axes.of(points), columns, rows)]
         if len(fitting) == 1 and asked is None:
@@ -235,13 +238,13 @@ class _Examination:
             "--map position_world=<layer> and --world_to_camera <16 numbers>",
         )
 
-    def _field_of_view(self, found: tuple[float, float]) -> None:
+    def _field_of_view(self, pixel: float) -> None:
         """Whether the camera's field of view is the one that the positions imply."""
         if self.camera is None:
             return
-        wide = found[0] * self.camera.pixels_per_unit  # how much wider they are
+        wide = pixel * self.camera.pixels_per_unit  # how much wider they are
         if not 0.9 < wide < 1.1:
-            half = np.degrees(np.arctan(0.5 * self.camera.width * found[0]))
+            half = np.degrees(np.arctan(0.5 * self.camera.width * pixel))
             self.warn(
                 f"the positions span {2 * half:.3g}° across the frame, but the field of view is "
                 f"{self.camera.fov:.3g}°"

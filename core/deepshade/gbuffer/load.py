@@ -20,7 +20,8 @@ from deepshade.gbuffer import background, channels, derivation
 from deepshade.gbuffer.checks import Verdict, examine
 from deepshade.gbuffer.conventions import Conventions, apply
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
-from deepshade.gbuffer.profiles import QUANTITIES
+from deepshade.gbuffer.profiles import QUANTITIES, number
+from deepshade.gbuffer.repair import repair
 from deepshade.gbuffer.sources import passed_over
 
 Source = Path | str | bytes | tuple[str, bytes]
@@ -81,6 +82,7 @@ class _Job:
     part: exr.Part
     used: frozenset[str]
     conventions: Conventions
+    radius: float | None
 
 
 def load_gbuffer(sources: Source | Sequence[Source], needs: Sequence[str], **how: Any) -> GBuffer:
@@ -99,6 +101,7 @@ def load_gbuffers(
     headers: Sequence[Header] | None = None,
     anew: Collection[str] = (),
     conventions: Conventions | None = None,
+    radius: float | None = None,
 ) -> Generator[GBuffer]:
     """Loads one EXR file, or several of one view, for each of `needs`: names of attributes.
 
@@ -107,6 +110,7 @@ def load_gbuffers(
     comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
     What isn't there, or is to be `anew`, is derived (`derivation`): `GBuffer.derived` says how.
     `conventions` say how values are stored, and which checks they have to pass (`checks`).
+    Positions whose steps are coarse beside the `radius` (by default the header's) are smoothed.
     `headers` are what `exr.read_header` gave for the same sources, to spare reading them again.
 
     Each G-buffer is what it would be alone. They share arrays, and so what is decoded and derived
@@ -145,7 +149,7 @@ def load_gbuffers(
         return found
 
     try:
-        jobs = [_job(each, plan(each), mapping or {}, conventions) for each in needs]
+        jobs = [_job(each, plan(each), mapping or {}, conventions, radius) for each in needs]
     except MissingAttributeError:
         if len(needs) > 1:
             plan(every)  # which says all that is missing
@@ -156,7 +160,11 @@ def load_gbuffers(
 
 
 def _job(
-    needs: Sequence[str], plan: Plan, mapping: Collection[str], conventions: Conventions
+    needs: Sequence[str],
+    plan: Plan,
+    mapping: Collection[str],
+    conventions: Conventions,
+    radius: float | None,
 ) -> _Job:
     steps: dict[str, derivation.Derivation] = {}
     for name in needs:
@@ -170,7 +178,7 @@ def _job(
     part = plan.parts(next(iter(choices.values())))[0]
     if plan.camera:
         plan.camera = framed(plan.camera, part)
-    return _Job(needs, plan, choices, steps, part, frozenset(used), conventions)
+    return _Job(needs, plan, choices, steps, part, frozenset(used), conventions, radius)
 
 
 def _load(
@@ -244,6 +252,12 @@ def _together(
     if len(jobs) > 1 and not background.same(arrays, suspects, [job.choices for job in jobs]):
         return None
     empty, nonfinite = background.remove(arrays, suspects)
+    plan = jobs[0].plan
+    if jobs[0].conventions.checks != "trust":
+        reach = jobs[0].radius or number(plan.attributes, "deepshade:radius")
+        mended = repair(arrays, ~empty, plan.camera, plan.matrix, reach if reach > 0 else None)
+        for name, note in mended.items():
+            verdict.note(name, note)
     steps = {name: step for job in jobs for name, step in job.steps.items()}
     if steps:
         empty, more = _derive(steps.values(), jobs[0].plan, arrays, empty)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from deepshade.gbuffer.axes import Axes
 
 Array = NDArray[np.floating[Any]]
+Line = tuple[float, float]  # slope, and value at pixel 0
 
 _CENTRES = 600  # pixels that each have a neighbour to the right and one below
 _OFF = 0.01  # of the picture's width: how far from its pixel a position may lie, in the median
@@ -92,8 +93,8 @@ def misfits(
 
 def projection(
     points: Array, columns: NDArray[np.intp], rows: NDArray[np.intp], *, parallel: bool = False
-) -> tuple[float, float] | None:
-    """(x, y) sizes of a pixel on the plane at distance 1, where positions (3, N) lie on the rays of
+) -> tuple[Line, Line] | None:
+    """How x / -z goes with columns and y / -z with rows where positions (3, N) lie on the rays of
     their pixels, before a camera at 0; None where they don't. `parallel` rays are orthographic."""
     depth = -points[2]
     if (depth > 0).mean() < 0.9:
@@ -102,13 +103,13 @@ def projection(
     scale = np.ones_like(depth[good]) if parallel else depth[good]
     right = _line(points[0][good] / scale, columns[good])
     down = _line(points[1][good] / scale, rows[good])
-    if right is None or down is None or right <= 0 or down >= 0:
+    if right is None or down is None or right[0] <= 0 or down[0] >= 0:
         return None
-    return right, -down
+    return right, down
 
 
-def _line(values: Array, pixels: NDArray[np.intp]) -> float | None:
-    """The slope of `values` over `pixels`, if they lie on a line, but for a few."""
+def _line(values: Array, pixels: NDArray[np.intp]) -> Line | None:
+    """The line of `values` over `pixels`, if they lie on one, but for a few."""
     span = float(pixels.max() - pixels.min())
     if span < 4:
         return None
@@ -120,4 +121,5 @@ def _line(values: Array, pixels: NDArray[np.intp]) -> float | None:
         usual = float(np.median(off))
         near = off <= 4 * usual + 1e-12
         x, y = x[near], y[near]
-    return slope if usual <= max(1.0, _OFF * span) * abs(slope) else None
+    off_line = usual > max(1.0, _OFF * span) * abs(slope)
+    return None if off_line else (slope, float(mean - slope * middle))
