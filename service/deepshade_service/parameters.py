@@ -9,12 +9,18 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.fields import FieldInfo
 
+from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS, SETTINGS, Effect
 from deepshade.errors import ConfigError
 from deepshade.exr import COMPRESSIONS
-from deepshade.attributes import ATTRIBUTES
 from deepshade.gbuffer.channels import parse_mapping
-from deepshade.gbuffer.conventions import ENCODINGS, Checks, Conventions, parse_axes, parse_conventions
+from deepshade.gbuffer.conventions import (
+    ENCODINGS,
+    Checks,
+    Conventions,
+    parse_axes,
+    parse_conventions,
+)
 from deepshade.gbuffer.depths import KINDS, MEANINGS
 from deepshade.gbuffer.profiles import PROFILES
 from deepshade_service.problems import Problem
@@ -85,15 +91,16 @@ class ShadeParameters(BaseModel):
         list[str],
         Field(
             description="`vector:axes`, repeatable: our x, y and z (right, up, towards the viewer)"
-            " from the stored ones, as `position:x,-y,-z`, or `opengl`, `opencv`, `directx`, `unity`"
-            " or `unreal`; without a vector, of position and normal. Else they are found out."
+            " from the stored ones, as `position:x,-y,-z`, or `opengl`, `opencv`, `directx`,"
+            " `unity` or `unreal`; without a vector, of position and normal."
+            " Else they are found out."
         ),
     ] = []
     normals: Annotated[
         Normals | None,
         Field(
-            description="How normals are stored: `signed`, `encoded` (n / 2 + 1 / 2) or `scaled` (of"
-            " any length). Else it is found out."
+            description="How normals are stored: `signed`, `encoded` (n / 2 + 1 / 2) or `scaled`"
+            " (of any length). Else it is found out."
         ),
     ] = None
     depth: Annotated[
@@ -196,9 +203,7 @@ class ShadeParameters(BaseModel):
         Raises ConfigError for a kind of depth without its planes.
         """
         checks: Checks = "trust" if self.trust else "strict" if self.strict else "usual"
-        return parse_conventions(
-            self.axes, self.normals, self.depth, self.near, self.far, checks
-        )
+        return parse_conventions(self.axes, self.normals, self.depth, self.near, self.far, checks)
 
     @property
     def mapping(self) -> dict[str, str]:

@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 MIN_PAIRS = 64  # fewer say nothing
 _ALIKE = 0.04  # misfits that differ by less say nothing: wrong readings differ by .06 and more
-_GOOD = 0.15  # misfit that no wrong reading of real views reached
+_GOOD = _ALIKE  # misfit that no other reading can be so much better than
 _UNLIKELY = 0.6  # misfit of surfaces and normals that have little to do with each other
 _LENGTH = 0.1  # by how much a normal may be too short or too long, in the median
 _MOST, _FEW = 0.9, 0.1
@@ -136,9 +136,9 @@ class _Examination:
 
     def _something(self) -> bool:
         """Whether anything is shown. Raises where one attribute shows nothing and another does."""
-        pixels = max(1, np.count_nonzero(self.inside))
+        pixels = max(1, int(np.count_nonzero(self.inside)))
         share = {
-            name: np.count_nonzero(shown & self.inside) / pixels
+            name: float(np.count_nonzero(shown & self.inside)) / pixels
             for name, shown in self.shown.items()
             if name != "alpha"
         }
@@ -227,7 +227,7 @@ class _Examination:
             )
         if projection(points, columns, rows, parallel=True):
             self.warn(
-                "the positions are those of an orthographic camera; shaders learned from perspective"
+                "the positions are those of an orthographic camera; shaders learned perspective"
             )
             return
         side = float((stored[2, shown] > 0).mean())
@@ -283,7 +283,8 @@ class _Examination:
             points = self.values(source).astype(np.float64)
             if source == "position_world":
                 assert self.matrix is not None
-                points = np.tensordot(self.matrix[:3, :3], points, 1) + self.matrix[:3, 3, None, None]
+                points = np.tensordot(self.matrix[:3, :3], points, 1)
+                points += self.matrix[:3, 3, None, None]
             return -points[2], points / -points[2]
         rays = self.rays
         slant = np.sqrt((rays * rays).sum(0))
@@ -338,12 +339,14 @@ class _Examination:
         normals: Array,
     ) -> None:
         """Takes the reading that fits best if it is the only one; raises otherwise."""
-        seen = f"{facing:.0%} of '{name}' faces the camera" if facing < _MOST else (
-            f"'{name}' and '{source}' contradict each other"
+        seen = (
+            f"{facing:.0%} of '{name}' faces the camera"
+            if facing < _MOST
+            else (f"'{name}' and '{source}' contradict each other")
         )
         if not equals:
             raise ContradictionError(
-                f"{seen}, and with no axes and signs does it fit the surfaces that '{source}' shows",
+                f"{seen}, and with no axes does it fit the surfaces that '{source}' shows",
                 seen=seen,
                 fix=f"if it is of world space: --map normal_world=<layer>; to have it calculated "
                 f"from '{source}': --derive {name}",

@@ -28,9 +28,9 @@ class Conventions:
     """What a request says of the stored values; what it leaves out is found out.
 
     `axes` of vectors by quantity; `normals` are "signed" (-1 to 1), "encoded" (n / 2 + 1 / 2) or
-    "scaled" (of any length); `depth` is of a kind (`depths.MEANINGS`), with the depths of the `near`
-    and the `far` plane where it needs them. `checks`: "strict" makes warnings errors, "trust"
-    believes everything. Raises ConfigError for planes that are missing or make no sense.
+    "scaled" (of any length); `depth` is of a kind (`depths.MEANINGS`), with the depths of the
+    `near` and the `far` plane where it needs them. `checks`: "strict" makes warnings errors,
+    "trust" believes everything. Raises ConfigError for planes that are missing or make no sense.
     """
 
     axes: Mapping[str, Axes] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class Reading:
 
         `slant` is as in `depths.planar`.
         """
-        values = stored
+        values: NDArray[Any] = stored
         if self.encoding == "encoded":
             # what no renderer writes for a surface: nothing, and nothing encoded
             empty = (stored == 0).all(0) | (np.abs(stored - 0.5) < 1 / 128).all(0)

@@ -26,7 +26,8 @@ def check_planes(kind: Kind | None, near: float | None, far: float | None) -> No
     """Raises ConfigError where a kind of depth lacks its planes, or they make no sense."""
     if kind in PLANES and (near is None or (far is None and kind != "reversed")):
         raise ConfigError(
-            "near", detail=f"'{kind}' depth ({MEANINGS[kind]}) needs the planes' depths near and far"
+            "near",
+            detail=f"'{kind}' depth ({MEANINGS[kind]}) needs the planes' depths near and far",
         )
     if near is not None and far is not None and not 0 < near < far:
         raise ConfigError("near", detail=f"near ({near:g}) must be above 0 and below far ({far:g})")
@@ -47,7 +48,7 @@ def planar(
     What isn't positive stays so, and shows nothing.
     """
     if kind == "planar":
-        depth = stored
+        depth: NDArray[Any] = stored
     elif kind == "distance":
         assert slant is not None, "the plan makes sure of the field of view"
         depth = stored / slant

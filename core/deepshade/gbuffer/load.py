@@ -38,9 +38,10 @@ class GBuffer:
     the pixels that held NaN or infinities (an infinite depth is a renderer's way to say
     background and doesn't count). `mapped` tells which channels each quantity came from,
     `decoded` all that were read for that, as (file, channel), and `derived` how the others were
-    computed, or how what is there had to be read; `warnings` say what looks unlikely. The windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes
-    came from, `part_header` its own attributes; `header` holds those of all parts and files, the
-    first of each name. `up` is the world's up axis, as its renderer has it.
+    computed, or how what is there had to be read; `warnings` say what looks unlikely. The
+    windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes came from,
+    `part_header` its own attributes; `header` holds those of all parts and files, the first of
+    each name. `up` is the world's up axis, as its renderer has it.
     """
 
     attributes: dict[str, NDArray[np.float32]]

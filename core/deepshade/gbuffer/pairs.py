@@ -42,7 +42,7 @@ class Pairs:
     @property
     def count(self) -> int:
         """How many pairs there are."""
-        return self.columns.shape[1]
+        return int(self.columns.shape[1])
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -77,7 +77,8 @@ def match_rank(layer: str, alias: str, *, from_stem: bool = False) -> int | None
 
     Prefixes end at a dot, slash or colon ("ViewLayer.Normal"), or at an underscore for aliases of
     three letters and more ("shot_normal"); file stems (`from_stem`) may have any of those, and a
-    frame number, a version ("v012") or the name of a grey channel at the end. None when it doesn't fit.
+    frame number, a version ("v012") or the name of a grey channel at the end. None when it doesn't
+    fit.
     """
     if from_stem:
         layer = re.sub(r"([._\-\s]*\d+|[._\-\s]+(v\d+|[yvl]))+$", "", layer, flags=re.I)

@@ -1,8 +1,8 @@
 """Positions of few bits made smooth again, as far as what is stored allows.
 
 A stored number stands for all that were rounded to it. A pinhole camera makes x, y and z three
-measurements of one depth, whose intervals are intersected; in what is left, depth goes on from pixel
-to pixel as the planes of the normals say.
+measurements of one depth, whose intervals are intersected; in what is left, depth goes on from
+pixel to pixel as the planes of the normals say.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ def steps_of(
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """How positions are seen, in their own space: along `rays` (3, H, W), of length 1 along the view
-    axis, from the `eye` (3,)."""
+    """How positions are seen, in their own space: along `rays` (3, H, W), of length 1 along the
+    view axis, from the `eye` (3,)."""
 
     rays: Float
     eye: NDArray[np.float64]
@@ -178,20 +178,19 @@ def _smoothed(
         constant[here] -= change
     share = 1 / np.maximum(weight, 1)
     constant *= share
-    alone = weight == 0
     low, high = np.where(usable, low, 0), np.where(usable, high, 0)
     depth = 0.5 * (low + high)
-    kept = depth.copy()
-    total = np.empty_like(depth)
+    np.copyto(constant, depth, where=weight == 0)  # what has no neighbour stays
+    shares = [(here, there, link * share[there], link * share[here]) for here, there, link in links]
+    total, part = np.empty_like(depth), np.empty_like(depth)
     for _ in range(rounds):
-        total[...] = 0
-        for here, there, link in links:
-            total[there] += link * depth[here]
-            total[here] += link * depth[there]
-        total *= share
-        total += constant
+        total[...] = constant
+        for here, there, onward, back in shares:
+            for source, target, link in ((here, there, onward), (there, here, back)):
+                product = part[: link.shape[0], : link.shape[1]]
+                np.multiply(link, depth[source], out=product)
+                total[target] += product
         np.clip(total, low, high, out=depth)
-        depth[alone] = kept[alone]
     return depth
 
 
@@ -202,10 +201,10 @@ def repair(
     matrix: NDArray[np.float64] | None,
     radius: float | None,
 ) -> dict[str, str]:
-    """Smooths positions among the `arrays` whose steps are coarse, in place; what was done, by name.
+    """Smooths positions among the `arrays` whose steps are coarse, in place; what was done.
 
-    Coarse is a step over a 300th of `radius`, by default 15 % of the median depth. `valid` (H, W) is
-    where there are surfaces.
+    Coarse is a step over a 300th of `radius`, by default 15 % of the median depth. `valid` (H, W)
+    is where there are surfaces.
     """
     name = "position" if "position" in arrays else "position_world"
     if name not in arrays or (name == "position_world" and matrix is None):

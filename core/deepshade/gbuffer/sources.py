@@ -34,7 +34,9 @@ def passed_over(
     places = [
         name
         for name in ("position", "position_world")
-        if name in plan.choices and name not in mapping and name not in conventions.axes
+        if name in plan.choices
+        and name not in mapping
+        and name not in conventions.axes
         and plan.half(plan.choices[name])
     ]
     if "position" in plan.choices:
@@ -61,7 +63,9 @@ def passed_over(
         if place == "position_world":
             assert plan.matrix is not None
             placed = plan.matrix[:3, :3] @ points + plan.matrix[:3, 3:]
-        good = np.isfinite(by_depth) & (by_depth > 0) & (by_depth < 1e10) & np.isfinite(placed).all(0)
+        good = (
+            np.isfinite(by_depth) & (by_depth > 0) & (by_depth < 1e10) & np.isfinite(placed).all(0)
+        )
         if np.count_nonzero(good) < 16:
             return {}
         coarse = float(np.median(_step(points[:, good], np.float16).max(0)))
@@ -78,4 +82,5 @@ def passed_over(
 
 def _step(values: NDArray[np.float64], kind: Any) -> NDArray[np.float64]:
     """The distance to the next number of that type."""
-    return np.abs(np.spacing(values.astype(kind))).astype(np.float64)
+    step: NDArray[np.float64] = np.abs(np.spacing(values.astype(kind))).astype(np.float64)
+    return step
