@@ -21,7 +21,7 @@ from deepshade.gbuffer.axes import AS_STORED, EVERY, Axes
 from deepshade.gbuffer.background import DEPTHS, FAR
 from deepshade.gbuffer.conventions import NORMALS, Conventions, Reading
 from deepshade.gbuffer.depths import MEANINGS, Kind
-from deepshade.gbuffer.pairs import Pairs, misfits, projection, slopes_between
+from deepshade.gbuffer.pairs import CENTRES, Pairs, misfits, projection, slopes_between
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
@@ -64,9 +64,13 @@ def examine(
     """
     verdict = Verdict({name: conventions.reading(name) for name in arrays})
     if conventions.checks != "trust":
-        pairs = Pairs.of(next(iter(arrays.values())).shape[1:], apart=4 if coarse else 1)
+        shape, apart = next(iter(arrays.values())).shape[1:], 4 if coarse else 1
+        few, many = (Pairs.of(shape, apart=apart, centres=centres) for centres in CENTRES)
+        given = arrays, used, camera, matrix, conventions
         with np.errstate(all="ignore"):
-            _Examination(arrays, used, camera, matrix, conventions, pairs, verdict).all()
+            if not _Examination(*given, few, verdict).passed():
+                verdict = Verdict({name: conventions.reading(name) for name in arrays})
+                _Examination(*given, many, verdict).all()
         if conventions.checks == "strict" and verdict.warnings:
             raise ContradictionError(
                 "; ".join(verdict.warnings), fix="leave out --strict to have it shaded"
@@ -90,10 +94,19 @@ class _Examination:
     ) -> None:
         self.camera, self.matrix, self.asked, self.pairs = camera, matrix, asked, pairs
         self.used, self.verdict = used, verdict
+        self.clear = True  # no other reading fits nearly as well
         self.stored = {name: pairs.cut(array) for name, array in arrays.items()}
         self.shown = {name: _shown(name, values) for name, values in self.stored.items()}
         alpha = self.stored.get("alpha")
         self.inside = np.ones(pairs.shape, np.bool_) if alpha is None else alpha[0] > 0
+
+    def passed(self) -> bool:
+        """Whether everything is right, by a good margin."""
+        try:
+            self.all()
+        except ContradictionError:
+            return False
+        return self.clear and not self.verdict.notes and not self.verdict.warnings
 
     def all(self) -> None:
         """Every check; the later ones look at what the earlier ones have put right."""
@@ -177,7 +190,7 @@ class _Examination:
         if self.asked.normals is not None or np.count_nonzero(shown) < MIN_PAIRS:
             return
         vectors = stored[:, shown]
-        length = _median_length(vectors)
+        length = _median_length(vectors[:, ::4])
         if abs(length - 1) <= _LENGTH:
             return
         low, high = float(vectors.min()), float(vectors.max())
@@ -193,6 +206,8 @@ class _Examination:
         stored, shown = self.stored["position"], self.shown["position"] & self.inside
         if np.count_nonzero(shown) < MIN_PAIRS or self.pairs.thin:
             return
+        shown = shown.copy()
+        shown[1] &= self.pairs.count < 4 * MIN_PAIRS  # neighbours say the same
         columns, rows = self.pairs.columns[shown], self.pairs.rows[shown]
         asked = self.asked.axes.get("position")
         points = stored[:, shown]
@@ -307,7 +322,7 @@ class _Examination:
         slopes = {kind: slopes_between(at[:, both], rays) for kind, (at, _) in places.items()}
         if name == "normal_world" and self.matrix is not None:  # the rays into their space
             rays = np.tensordot(rotation_of(self.matrix).T, rays, 1)
-        (stated,), (facing,) = misfits(normals, rays, slopes[kinds[0]], [reading.axes])
+        (stated,), (facing,) = misfits(normals, rays, slopes[kinds[0]], (reading.axes,))
         if stated < _GOOD and facing > _MOST:
             return True
         every = (reading.axes,) if name in self.asked.axes else EVERY
@@ -319,6 +334,7 @@ class _Examination:
         ]
         tried.sort(key=lambda each: each[0])
         least = tried[0][0] if tried else 1.0
+        self.clear &= bool(stated < least - _ALIKE)
         if facing > _SEEN and stated < least + _ALIKE:
             if stated > _UNLIKELY:
                 self.warn(f"'{name}' hardly fits the surfaces that '{source}' shows")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from deepshade.gbuffer.axes import Axes
 Array = NDArray[np.floating[Any]]
 Line = tuple[float, float]  # slope, and value at pixel 0
 
-_CENTRES = 600  # pixels that each have a neighbour to the right and one below
+# pixels that each have a neighbour to the right and one below: usually, and where they don't tell
+CENTRES = (200, 2000)
 _OFF = 0.01  # of the picture's width: how far from its pixel a position may lie, in the median
 
 
@@ -28,10 +29,11 @@ class Pairs:
     height: int
 
     @classmethod
-    def of(cls, shape: tuple[int, ...], *, apart: int = 1) -> Pairs:
-        """Of a picture (H, W): those on a grid that spans it."""
+    @lru_cache(64)  # pictures come in sequences
+    def of(cls, shape: tuple[int, ...], *, apart: int = 1, centres: int = CENTRES[-1]) -> Pairs:
+        """Of a picture (H, W): those on a grid of about as many `centres` that spans it."""
         height, width = shape
-        step = max(1, round((height * width / _CENTRES) ** 0.5))
+        step = max(1, round((height * width / centres) ** 0.5))
         ends: list[tuple[NDArray[Any], ...]] = []
         for right, down in ((apart, 0), (0, apart)):
             y, x = np.mgrid[0 : max(0, height - down) : step, 0 : max(0, width - right) : step]
@@ -68,7 +70,7 @@ def slopes_between(depths: Array, rays: Array) -> Array:
 
 
 def misfits(
-    normals: Array, rays: Array, slopes: Array, axes: Sequence[Axes]
+    normals: Array, rays: Array, slopes: Array, axes: tuple[Axes, ...]
 ) -> tuple[Array, Array]:
     """How far stored `normals` (3, 2, N) and `slopes_between` disagree if read with each of `axes`
     (0 to 1), and the share of normals that face the camera then; (K,) each.
@@ -79,16 +81,22 @@ def misfits(
     """
     # every stored component times every ray's, of both ends and both rays: (9, 4 N)
     products = normals[:, None, :, None] * rays[None, :, None, :]
-    weights = np.zeros((len(axes), 9), np.float32)
-    for row, each in zip(weights, axes, strict=True):
-        for i, (axis, sign) in enumerate(zip(each.order, each.signs, strict=True)):
-            row[3 * axis + i] = sign
-    dots = weights @ products.reshape(9, -1).astype(np.float32)
+    dots = _weights(axes) @ products.reshape(9, -1).astype(np.float32)
     dots = dots.reshape(len(axes), 2, 2, -1)  # normals of which end, ray of which end
     expected = dots[:, 0, 0] * dots[:, 1, 0] / (dots[:, 0, 1] * dots[:, 1, 1])
     change, apart = slopes.astype(np.float32)
     error = np.abs(change - np.log(expected) / (2 * apart))
     return np.fmin(error, 1).mean(1), (dots[:, 0, 0] < 0).mean(1)
+
+
+@lru_cache(64)
+def _weights(axes: tuple[Axes, ...]) -> NDArray[np.float32]:
+    """Of which products of components a dot product consists: (K, 9)."""
+    weights = np.zeros((len(axes), 9), np.float32)
+    for row, each in zip(weights, axes, strict=True):
+        for i, (axis, sign) in enumerate(zip(each.order, each.signs, strict=True)):
+            row[3 * axis + i] = sign
+    return weights
 
 
 def projection(
@@ -99,10 +107,12 @@ def projection(
     depth = -points[2]
     if (depth > 0).mean() < 0.9:
         return None
-    good = depth > 0
-    scale = np.ones_like(depth[good]) if parallel else depth[good]
-    right = _line(points[0][good] / scale, columns[good])
-    down = _line(points[1][good] / scale, rows[good])
+    if not (depth > 0).all():
+        good = depth > 0
+        points, depth, columns, rows = points[:, good], depth[good], columns[good], rows[good]
+    scale = np.ones_like(depth) if parallel else depth
+    right = _line(points[0] / scale, columns)
+    down = _line(points[1] / scale, rows)
     if right is None or down is None or right[0] <= 0 or down[0] >= 0:
         return None
     return right, down
@@ -119,6 +129,8 @@ def _line(values: Array, pixels: NDArray[np.intp]) -> Line | None:
         slope = float(((x - middle) * (y - mean)).sum() / ((x - middle) ** 2).sum())
         off = np.abs(y - mean - slope * (x - middle))
         usual = float(np.median(off))
+        if off.max() < 0.1 * abs(slope):
+            break
         near = off <= 4 * usual + 1e-12
         x, y = x[near], y[near]
     off_line = usual > max(1.0, _OFF * span) * abs(slope)

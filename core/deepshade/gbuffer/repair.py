@@ -209,7 +209,9 @@ def repair(
     name = "position" if "position" in arrays else "position_world"
     if name not in arrays or (name == "position_world" and matrix is None):
         return {}
-    pixels = np.flatnonzero(valid)[:: max(1, np.count_nonzero(valid) // _SAMPLE)]
+    # an odd number, so that they don't all lie in a few columns
+    pixels = np.arange(0, valid.size, (valid.size // _SAMPLE) | 1)
+    pixels = pixels[valid.ravel()[pixels]]
     some = arrays[name].reshape(3, -1)[:, pixels]
     # most files are finer, which depth alone tells
     if lattice(some[2]) is None:
