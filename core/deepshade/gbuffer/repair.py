@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.camera import Camera, rotation_of
-from deepshade.gbuffer.pairs import projection
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -27,6 +26,8 @@ _SLACK = 0.25  # of an interval: its ends are as exact as the pixels' rays
 _CONSISTENT = 0.85  # share of pixels whose three intervals must meet
 _SAMPLE = 1500  # pixels that steps are looked for in
 _FINE = 300  # steps in a radius that do no harm
+_FINE_DEPTH = 60  # those of depth alone: it errs along the ray, where it is seen least
+_SOURCES = ("position", "position_world", "depth")  # the first is taken
 _SHARE = 0.15  # of the median depth: the radius where none is known
 
 
@@ -139,14 +140,36 @@ def repaired(
         met = np.count_nonzero((low <= high) & valid)
         if met < _CONSISTENT * np.count_nonzero(valid):
             return None
-        low, high = np.fmin(low, high), np.fmax(low, high)
+        return between(np.fmin(low, high), np.fmax(low, high), valid, normals, rounds=rounds)
+
+
+def between(
+    low: Float,
+    high: Float,
+    valid: Mask,
+    normals: tuple[Float, Float] | None,
+    *,
+    rounds: int = ROUNDS,
+) -> Float:
+    """Smooth depths (H, W) between `low` and `high`, 0 where not `valid`; else as `repaired`."""
+    with np.errstate(all="ignore"):
         usable = valid & (low > 0) & np.isfinite(high)
         depth = 0.5 * (low + high)
         if normals is not None:
             smooth = np.exp(_smoothed(np.log(low), np.log(high), *normals, usable, rounds))
-            np.copyto(depth, smooth, where=usable)
+        else:  # a plane's 1 / depth is linear in the picture: the mean of its neighbours
+            minus = np.float32(-1)
+            smooth = minus / _evened(minus / low, minus / high, usable, rounds)
+        np.copyto(depth, smooth, where=usable)
     depth[~(valid & np.isfinite(depth))] = 0
     return depth
+
+
+_Half = tuple[slice, slice]
+_SIDES: tuple[tuple[_Half, _Half], ...] = (  # pixels, and their neighbours to the right and below
+    ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+    ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+)
 
 
 def _smoothed(
@@ -154,11 +177,8 @@ def _smoothed(
 ) -> Float:
     """Logarithms of depth between `low` and `high` that go on as the normals' planes say."""
     facing = usable & ((normals * rays).sum(0) < -_GRAZING)
-    weight = np.zeros(usable.shape, np.float32)
-    links: list[tuple[tuple[slice, slice], tuple[slice, slice], Float]] = []
-    every, first, last = slice(None), slice(None, -1), slice(1, None)
-    constant = np.zeros(usable.shape, np.float32)
-    for here, there in (((every, first), (every, last)), ((first, every), (last, every))):
+    changes, links = [], []
+    for here, there in _SIDES:
         a, b = (slice(None), *here), (slice(None), *there)
         crossed = (
             (normals[a] * rays[a]).sum(0) * (normals[b] * rays[a]).sum(0),
@@ -169,29 +189,54 @@ def _smoothed(
         joined = facing[here] & facing[there] & np.isfinite(change)
         # and only where it can: not across edges
         joined &= (low[here] + change <= high[there]) & (high[here] + change >= low[there])
-        link = joined.astype(np.float32)
-        change = np.where(joined, change, 0)
-        links.append((here, there, link))
-        weight[there] += link
-        weight[here] += link
+        changes.append(np.where(joined, change, 0))
+        links.append(joined)
+    return _relaxed(low, high, changes, links, usable, rounds)
+
+
+def _evened(low: Float, high: Float, usable: Mask, rounds: int) -> Float:
+    """Values between `low` and `high` that are the mean of their neighbours'."""
+    links = []
+    for here, there in _SIDES:
+        wide = 0.5 * (high[here] - low[here] + high[there] - low[there])
+        joined = usable[here] & usable[there]
+        joined &= (low[here] - wide <= high[there]) & (high[here] + wide >= low[there])
+        links.append(joined)
+    none = [np.zeros(link.shape, np.float32) for link in links]
+    return _relaxed(low, high, none, links, usable, rounds)
+
+
+def _relaxed(
+    low: Float, high: Float, changes: list[Float], links: list[Mask], usable: Mask, rounds: int
+) -> Float:
+    """By Jacobi's method, between `low` and `high`: each the mean of what its neighbours to the
+    right and below, and left and above, by these `changes`, say of it where they are linked."""
+    weight = np.zeros(usable.shape, np.float32)
+    constant = np.zeros(usable.shape, np.float32)
+    for (here, there), change, joined in zip(_SIDES, changes, links, strict=True):
+        weight[there] += joined
+        weight[here] += joined
         constant[there] += change
         constant[here] -= change
     share = 1 / np.maximum(weight, 1)
     constant *= share
     low, high = np.where(usable, low, 0), np.where(usable, high, 0)
-    depth = 0.5 * (low + high)
-    np.copyto(constant, depth, where=weight == 0)  # what has no neighbour stays
-    shares = [(here, there, link * share[there], link * share[here]) for here, there, link in links]
-    total, part = np.empty_like(depth), np.empty_like(depth)
+    values = 0.5 * (low + high)
+    np.copyto(constant, values, where=weight == 0)  # what has no neighbour stays
+    shares = [
+        (here, there, joined * share[there], joined * share[here])
+        for (here, there), joined in zip(_SIDES, links, strict=True)
+    ]
+    total, part = np.empty_like(values), np.empty_like(values)
     for _ in range(rounds):
         total[...] = constant
         for here, there, onward, back in shares:
             for source, target, link in ((here, there, onward), (there, here, back)):
                 product = part[: link.shape[0], : link.shape[1]]
-                np.multiply(link, depth[source], out=product)
+                np.multiply(link, values[source], out=product)
                 total[target] += product
-        np.clip(total, low, high, out=depth)
-    return depth
+        np.clip(total, low, high, out=values)
+    return values
 
 
 def repair(
@@ -203,42 +248,39 @@ def repair(
 ) -> dict[str, str]:
     """Smooths positions among the `arrays` whose steps are coarse, in place; what was done.
 
-    Coarse is a step over a 300th of `radius`, by default 15 % of the median depth. `valid` (H, W)
-    is where there are surfaces.
+    Coarse is a step over a 300th of `radius` (of depth alone: a 60th), by default 15 % of the
+    median depth. `valid` (H, W) is where there are surfaces.
     """
-    name = "position" if "position" in arrays else "position_world"
-    if name not in arrays or (name == "position_world" and matrix is None):
+    name = next((name for name in _SOURCES if name in arrays), "")
+    if not name or (name == "position_world" and matrix is None):
         return {}
     # an odd number, so that they don't all lie in a few columns
     pixels = np.arange(0, valid.size, (valid.size // _SAMPLE) | 1)
     pixels = pixels[valid.ravel()[pixels]]
-    some = arrays[name].reshape(3, -1)[:, pixels]
+    some = arrays[name].reshape(len(arrays[name]), -1)[:, pixels]
+    if name == "depth":
+        return _depth(arrays, some[0], valid, camera, matrix, radius)
     # most files are finer, which depth alone tells
     if lattice(some[2]) is None:
         return {}
-    step = [lattice(values) for values in some]
-    if None in step:
+    step = [size for size in map(lattice, some) if size is not None]
+    if len(step) < 3:
         return {}
     linear, offset = np.eye(3), np.zeros(3)
     if name == "position_world" and matrix is not None:
         linear, offset = matrix[:3, :3], matrix[:3, 3]
     seen = linear @ some + offset[:, None]
-    steps = Steps(tuple(step), (0.0, 0.0, 0.0))  # type: ignore[arg-type]
+    steps = Steps((step[0], step[1], step[2]), (0.0, 0.0, 0.0))
     coarse = max(float(np.median(steps.of(some[axis], axis))) for axis in range(3))
     reach = radius or _SHARE * float(np.median(np.abs(seen[2])))
     if not coarse > reach / _FINE:
         return {}
     inverse = np.linalg.inv(linear)
     eye = -inverse @ offset
-    for rays in _rays(camera, seen, pixels, valid.shape):
+    for rays in _rays(camera, seen, pixels, valid.shape, coarse):
         there = np.tensordot(inverse, rays, 1).astype(np.float32)
         known = steps_of(some, there.reshape(3, -1)[:, pixels], eye, steps.step)
-        normals = None
-        if "normal" in arrays:
-            normals = arrays["normal"], rays
-        elif "normal_world" in arrays and matrix is not None:
-            turned = np.tensordot(rotation_of(matrix).T, rays, 1).astype(np.float32)
-            normals = arrays["normal_world"], turned
+        normals = _normals(arrays, rays, matrix)
         depth = repaired(arrays[name], View(there, eye), known, valid, normals)
         if depth is None:
             continue
@@ -250,18 +292,79 @@ def repair(
     return {}
 
 
+def _depth(
+    arrays: Mapping[str, Float],
+    some: Float,
+    valid: Mask,
+    camera: Camera | None,
+    matrix: NDArray[np.float64] | None,
+    radius: float | None,
+) -> dict[str, str]:
+    """`repair` of planar depth: one measurement, rounded or cut off."""
+    step = lattice(some)
+    if camera is None or step is None:
+        return {}
+    known = Steps((step, step, step), (0.0, 0.0, 0.0))
+    coarse = float(np.median(known.of(some, 0)))
+    if not coarse > (radius or _SHARE * float(np.median(some))) / _FINE_DEPTH:
+        return {}
+    depth = arrays["depth"][0]
+    size = known.of(depth, 0)
+    normals = _normals(arrays, camera.rays(*valid.shape[::-1]), matrix)
+    smooth = between(depth - (0.5 + _SLACK) * size, depth + (1 + _SLACK) * size, valid, normals)
+    np.copyto(depth, smooth, where=smooth > 0)
+    return {"depth": f"stored in steps of {coarse:.2g}; smoothed within them"}
+
+
+def _normals(
+    arrays: Mapping[str, Float], rays: Float, matrix: NDArray[np.float64] | None
+) -> tuple[Float, Float] | None:
+    """Normals, and the camera's rays in their space."""
+    if "normal" in arrays:
+        return arrays["normal"], rays
+    if "normal_world" in arrays and matrix is not None:
+        turned = np.tensordot(rotation_of(matrix).T, rays, 1).astype(np.float32)
+        return arrays["normal_world"], turned
+    return None
+
+
 def _rays(
-    camera: Camera | None, seen: NDArray[np.float64], pixels: NDArray[np.intp], shape: Any
+    camera: Camera | None,
+    seen: NDArray[np.float64],
+    pixels: NDArray[np.intp],
+    shape: Any,
+    coarse: float,
 ) -> Iterator[Float]:
     """The rays (3, H, W) that positions in camera space may lie on: the camera's; their own."""
     height, width = shape
     if camera is not None:
         yield camera.rays(width, height)
-    lines = projection(seen, pixels % width, pixels // width)
-    if lines is not None:
-        (right, left), (down, top) = lines
-        rays = np.empty((3, height, width), np.float32)
-        rays[0] = left + right * np.arange(width)
-        rays[1] = (top + down * np.arange(height))[:, None]
-        rays[2] = -1
-        yield rays
+    rays = np.full((3, height, width), -1, np.float32)
+    for axis, at, size in ((0, pixels % width, width), (1, pixels // width, height)):
+        line = _own(seen[axis], -seen[2], at, coarse)
+        along = line[0] * np.arange(size) + line[1]
+        rays[axis] = along if axis == 0 else along[:, None]
+    yield rays
+
+
+def _own(
+    values: NDArray[np.float64], depth: NDArray[np.float64], at: NDArray[np.intp], step: float
+) -> tuple[float, float]:
+    """(slope, offset) of the rays of pixels `at` that positions lie on, by least squares.
+
+    x = (a at + b) d, each of x and d off by the same part of a step everywhere, which makes two
+    more unknowns; that they are below a step is as good as one measurement of each.
+    """
+    middle = at.mean()
+    pixel = at - middle
+    span = step / max(1.0, float(np.abs(pixel).max()))
+    columns = np.stack([depth * pixel, depth, pixel * span, np.full(at.shape, step)], 1)
+    prior = 0.3 * step * np.eye(4)[2:]
+    known = np.concatenate([columns, prior]), np.concatenate([values, np.zeros(2)])
+    a, b, *_ = np.linalg.lstsq(*known, rcond=None)[0]
+    off = np.abs(values - columns[:, :2] @ (a, b))
+    near = off <= 4 * np.median(off)
+    columns, values = columns[near], values[near]
+    known = np.concatenate([columns, prior]), np.concatenate([values, np.zeros(2)])
+    a, b, *_ = np.linalg.lstsq(*known, rcond=None)[0]
+    return float(a), float(b - a * middle)
