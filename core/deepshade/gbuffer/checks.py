@@ -189,17 +189,19 @@ class _Examination:
         stored, shown = self.stored[name], self.shown[name] & self.inside
         if self.asked.normals is not None or np.count_nonzero(shown) < MIN_PAIRS:
             return
-        vectors = stored[:, shown]
-        length = _median_length(vectors[:, ::4])
-        if abs(length - 1) <= _LENGTH:
+        vectors = stored[:, shown][:, ::4]
+        length = _lengths(vectors)
+        off = float(np.abs(length - 1).mean())
+        if off <= _LENGTH / 2:
             return
-        low, high = float(vectors.min()), float(vectors.max())
-        decoded = 2 * vectors - 1
-        if low >= -0.01 and high <= 1.01 and abs(_median_length(decoded) - 1) <= _LENGTH:
+        # encoded ones may be of length 1 in the median: (0, 1, 0) is 1.22, and (-1, 0, 0) .71
+        inside = float(vectors.min()) >= -0.01 and float(vectors.max()) <= 1.01
+        if inside and float(np.abs(_lengths(2 * vectors - 1) - 1).mean()) < min(_LENGTH, off / 2):
             self.read(name, "stored as n / 2 + 1 / 2; decoded", encoding="encoded")
-        elif length > 0:
-            note = f"of length {length:.3g} in the median; made 1"
-            self.read(name, note, encoding="scaled")
+            return
+        usual = float(np.median(length))
+        if abs(usual - 1) > _LENGTH:
+            self.read(name, f"of length {usual:.3g} in the median; made 1", encoding="scaled")
 
     def _pixels(self) -> None:
         """Positions lie on the rays of their pixels: which axes make them do so?"""
@@ -409,5 +411,5 @@ def _shown(name: str, stored: Array) -> Mask:
     return np.asarray(finite & (stored != 0).any(0))
 
 
-def _median_length(vectors: Array) -> float:
-    return float(np.median(np.sqrt((vectors.astype(np.float64) ** 2).sum(0))))
+def _lengths(vectors: Array) -> Array:
+    return np.sqrt((vectors.astype(np.float64) ** 2).sum(0))
