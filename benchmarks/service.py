@@ -23,8 +23,8 @@ from deepshade.effects import EFFECTS
 from deepshade.engines import Backend, load_engine
 from deepshade.gbuffer import load_gbuffer
 from deepshade.machine import cpu_count, describe
+from deepshade.timing import Pace, alternate, ratio, spread
 from deepshade_report.server import STAGES, Server
-from deepshade_report.timing import Pace, alternate, ratio, spread
 
 
 def main() -> None:

@@ -41,9 +41,9 @@ BACKENDS = list(dict.fromkeys([*available(), PIECES]))
 
 
 @pytest.fixture(scope="module")
-def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bundle of every effect, trained for one step."""
-    root = tmp_path_factory.mktemp("nine")
+def models(made_once: Path) -> Path:
+    """A folder with a bundle of every effect, trained for one step."""
+    root = made_once / "balanced"
     for effect in EFFECTS:
         make_bundle(effect, root)
     return root

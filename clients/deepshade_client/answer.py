@@ -20,7 +20,7 @@ from deepshade_client.exceptions import BadAnswer
 _PREFIX = "deepshade-"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Answer:
     """A shaded picture as it was received.
 
@@ -33,6 +33,12 @@ class Answer:
     media_type: str
     facts: Mapping[str, str]
     timing: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        """What it is, without its bytes."""
+        known = [f"{k} {self.facts[k]}" for k in ("bundle", "radius") if k in self.facts]
+        size = f"{self.media_type}, {len(self.content):,} bytes"
+        return f"<Answer {', '.join((','.join(self.effects), size, *known))}>"
 
     @property
     def effects(self) -> list[str]:
@@ -64,8 +70,8 @@ class Answer:
     def channels(self) -> dict[str, NDArray[np.float32]]:
         """The decoded EXR: (H, W) float32 under "Y", or "R", "G" and "B".
 
-        Of several effects each is a layer: "ao.Y", "gi.R" and so on. Raises BadAnswer when it is
-        a PNG or can't be decoded.
+        Of several effects each is a layer: "ao.Y", "gi.R" and so on; so is an answer beside the
+        picture's own channels. Raises BadAnswer when it is a PNG or can't be decoded.
         """
         try:
             return exr.read(self.content).pixels
@@ -80,7 +86,8 @@ class Answer:
         channels, effects = self.channels(), self.effects
         found = {}
         for effect in effects:
-            layer = f"{effect}." if len(effects) > 1 else ""
+            layer = f"{effect}." if len(effects) > 1 else self.facts.get("layer", "")
+            layer += "." if layer and not layer.endswith(".") else ""
             names = [name for name in (f"{layer}{band}" for band in "YRGB") if name in channels]
             if not names:
                 raise BadAnswer(f"the answer holds no '{effect}', only {', '.join(channels)}")

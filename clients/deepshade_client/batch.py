@@ -5,15 +5,22 @@ from __future__ import annotations
 import asyncio
 import glob
 import os
+import re
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from deepshade import exr
+from deepshade.errors import ImageError, LimitError
+from deepshade_client import sequences
 from deepshade_client.answer import Saved
 from deepshade_client.client import AsyncClient
 from deepshade_client.exceptions import ClientError, ConnectionFailed
 from deepshade_client.request import Options
+from deepshade_client.sequences import View, sequence_of
+
+SUFFIXES = (".exr", ".png")
 
 
 class UsageError(ClientError):
@@ -22,17 +29,23 @@ class UsageError(ClientError):
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One view (one file, or several that belong together) and where its answer goes."""
+    """One view (one file, or several that belong together) and where its answer goes.
+
+    It isn't sent where it `lacks` files that the other frames of its `sequence` have.
+    """
 
     sources: tuple[Path, ...]
     target: Path
+    lacks: tuple[str, ...] = ()
+    sequence: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
     """What came of a task: facts or an error, and the seconds it took with all retries.
 
-    Neither the picture's bytes nor the answer's are in it: a batch may be long.
+    With neither it was skipped: its answer is there. Neither the picture's bytes nor the answer's
+    are in it: a batch may be long.
     """
 
     task: Task
@@ -41,46 +54,85 @@ class Result:
     error: Exception | None = None
 
 
-def views(inputs: Sequence[str], *, together: bool = False) -> list[tuple[Path, ...]]:
-    """The files of every view that `inputs` name, as in `plan`. Raises UsageError."""
-    found = list(_find(inputs, None))
-    return [tuple(found)] if together else [(path,) for path in found]
+def views(inputs: Sequence[str], *, together: bool | None = None) -> list[View]:
+    """The views that `inputs` name, as in `plan`. Raises UsageError."""
+    return sequences.views(_find(inputs, None), together=together)
 
 
-def together_or_one(sources: tuple[Path, ...]) -> Path | tuple[Path, ...]:
-    """A view as the client's picture argument: its only file, or the tuple of all."""
+def picture_of(sources: tuple[Path, ...]) -> Path | tuple[Path, ...]:
+    """A view's files as the client's picture argument: the only one, or the tuple of all."""
     return sources if len(sources) > 1 else sources[0]
 
 
 def plan(
-    inputs: Sequence[str], out: str, *, effect: str, suffix: str, together: bool = False
+    inputs: Sequence[str], out: str, *, effect: str, suffix: str, together: bool | None = None
 ) -> list[Task]:
-    """Pairs every input picture with its output path.
+    """Pairs every view with its output path.
 
-    `inputs` are files, folders (every .exr below them) and glob patterns. `out` is a file (for
-    one picture), a folder (same names and subfolders), or a pattern with {name} and {effect}.
-    With `together` all inputs are one view. Raises UsageError: nothing found, one file for many
-    pictures, two answers for one path, an answer that would replace an input.
+    `inputs` are files, folders (every .exr below them), glob patterns and patterns of frames
+    (`room.####.exr`, `room.%04d.exr`). `out` is a file (for one picture), a folder (same names
+    and subfolders), or a pattern with {name} and {effect}, or with #### or %04d for the frame.
+    With `together` all inputs are one view (True) or each its own (False), else what
+    `sequences` says. Raises UsageError: nothing found, one file for many pictures, two answers
+    for one path, an answer that would replace an input, a picture without a frame's number.
     """
-    is_folder = out.endswith(("/", os.sep)) or Path(out).is_dir()
-    everything = found = _find(inputs, Path(out).resolve() if is_folder else None)
-    if together:
-        found = dict(list(everything.items())[:1])
-    if "{" in out:
-        targets = [_fill(out, path, effect) for path in found]
+    is_folder = _is_folder(out)
+    files = _find(inputs, Path(out).resolve() if is_folder else None)
+    found = sequences.views(files, together=together)
+    if "{" in out or sequences.is_pattern(out):
+        targets = [_fill(out, view, effect) for view in found]
     elif is_folder or len(found) > 1:
-        if Path(out).suffix.lower() in (".exr", ".png") and not is_folder:
+        if Path(out).suffix.lower() in SUFFIXES and not is_folder:
             raise UsageError(
                 f"{len(found)} pictures can't all go to the file {out}",
-                fix="name a folder (with a / at its end), or a pattern such as 'out/{name}_ao.exr'",
+                fix="name a folder (with a / at its end), or a pattern such as 'ao.####.exr' "
+                "or 'out/{name}_ao.exr'; files of one view: --together",
             )
-        targets = [Path(out, relative).with_suffix(suffix) for relative in found.values()]
+        targets = [Path(out, view.folder, view.name + suffix) for view in found]
     else:
         targets = [Path(out)]
-    groups = [tuple(everything)] if together else [(path,) for path in found]
-    tasks = [Task(group, target) for group, target in zip(groups, targets, strict=True)]
-    _check_targets(tasks, set(everything))
+    tasks = [
+        Task(v.files, target, v.lacks, sequence_of(v.files) if v.frame is not None else None)
+        for v, target in zip(found, targets, strict=True)
+    ]
+    _check_targets(tasks, set(files))
     return tasks
+
+
+def suffix_of(out: str | None, *, png: bool) -> str:
+    """The suffix of the answers, which says what they are: that of `out`, else .png if asked for.
+
+    Raises UsageError for one that says something else.
+    """
+    found = "" if out is None or _is_folder(out) else Path(out).suffix.lower()
+    if found in SUFFIXES:
+        if png and found != ".png":
+            raise UsageError(
+                f"--png makes PNGs, but {out} ends in {found}",
+                fix="leave out --png, or name a .png file, or a folder",
+            )
+        return found
+    if re.fullmatch(r"\.[a-z]{2,5}", found):
+        raise UsageError(
+            f"answers are no {found} files, as {out} says",
+            fix="write .exr or .png; for a folder of that name put a / at its end",
+        )
+    return ".png" if png else ".exr"
+
+
+def is_done(task: Task) -> bool:
+    """Whether its answer is there: a whole file, newer than every file that it is made of."""
+    try:
+        made = task.target.stat().st_mtime_ns
+        if any(source.stat().st_mtime_ns >= made for source in task.sources):
+            return False
+        content = task.target.read_bytes()
+        if task.target.suffix.lower() == ".png":
+            return content.startswith(b"\x89PNG") and content.endswith(b"IEND\xaeB`\x82")
+        exr.read_header(content)
+    except (OSError, ImageError, LimitError):
+        return False
+    return True
 
 
 async def run(
@@ -91,32 +143,51 @@ async def run(
     *,
     jobs: int,
     done: Callable[[Result], None],
+    skip: bool = False,
 ) -> list[Result]:
     """Shade all tasks, `jobs` at a time, and save their answers; `done` hears of each.
 
     Errors become results. When nothing answers at the server's address, what hasn't started
-    isn't tried.
+    isn't tried. With `skip` what `is_done` is left as it is. Frames of a sequence are shaded at the
+    radius of its first one, unless one is named: else it would follow each one's depth and flicker.
     """
     queue = iter(tasks)
     results: list[Result] = []
     unreachable = False
+    radii: dict[Path, asyncio.Future[str | None]] = {}
 
     async def work() -> None:
         nonlocal unreachable
         for task in queue:
             if unreachable:
                 return
+            settings, first = options, None
+            if task.sequence and options.radius is None:
+                if known := radii.get(task.sequence):
+                    settings = replace(options, radius=await known)
+                else:
+                    first = radii[task.sequence] = asyncio.get_running_loop().create_future()
             start = time.perf_counter()
             saved: Saved | None = None
             failure: Exception | None = None
+            radius: str | None = None
             try:
-                picture = together_or_one(task.sources)
-                saved = await client.shade_to(task.target, effect, picture, options)
+                if task.lacks:
+                    raise _lacking(task)
+                if skip and await asyncio.to_thread(is_done, task):
+                    radius = await asyncio.to_thread(_radius_of, task.target) if first else None
+                else:
+                    picture = picture_of(task.sources)
+                    saved = await client.shade_to(task.target, effect, picture, settings)
+                    radius = _radius_among(saved.facts, ".")
             except (ClientError, OSError) as error:
                 # its traceback and its cause hold the request, with the picture in it
                 failure = error.with_traceback(None)
                 failure.__cause__ = failure.__context__ = None
                 unreachable |= isinstance(error, ConnectionFailed)
+            finally:
+                if first:
+                    first.set_result(radius)
             result = Result(task, time.perf_counter() - start, saved, failure)
             results.append(result)
             done(result)
@@ -125,6 +196,26 @@ async def run(
         for _ in range(min(jobs, len(tasks))):
             group.create_task(work())
     return results
+
+
+def _radius_of(answer: Path) -> str | None:
+    """That which a saved answer names."""
+    if answer.suffix.lower() != ".exr":
+        return None
+    return _radius_among(exr.read_header(answer).parts[0].attributes, ":")
+
+
+def _radius_among(facts: Mapping[str, object], between: str) -> str | None:
+    """That of one effect, or of the first of several, if it followed from depth."""
+    names = (name for name in facts if name.split(between)[-1] == "radius")
+    return next((str(facts[k]) for k in names if facts.get(f"{k}_source") == "depth"), None)
+
+
+def _lacking(task: Task) -> UsageError:
+    return UsageError(
+        f"there is no file of its {' and '.join(task.lacks)}, as most frames have",
+        fix="render it, or take each file for a picture of its own: --apart",
+    )
 
 
 def _find(inputs: Sequence[str], out: Path | None) -> dict[Path, Path]:
@@ -144,8 +235,9 @@ def _find(inputs: Sequence[str], out: Path | None) -> dict[Path, Path]:
         elif path.exists():
             found.setdefault(path, Path(path.name))
         else:
+            matches = sequences.matches(text) if sequences.is_pattern(text) else []
             # Path.glob takes no absolute patterns.
-            matches = sorted(Path(match) for match in glob.glob(text, recursive=True))  # noqa: PTH207
+            matches = matches or sorted(Path(match) for match in glob.glob(text, recursive=True))  # noqa: PTH207
             if not matches:
                 raise UsageError(f"there is no file, folder or match for {text}")
             for match in matches:
@@ -156,13 +248,25 @@ def _find(inputs: Sequence[str], out: Path | None) -> dict[Path, Path]:
     return found
 
 
-def _fill(pattern: str, source: Path, effect: str) -> Path:
+def _is_folder(out: str) -> bool:
+    return out.endswith(("/", os.sep)) or Path(out).is_dir()
+
+
+def _fill(pattern: str, view: View, effect: str) -> Path:
+    filled = pattern
+    if sequences.is_pattern(pattern):
+        if view.frame is None:
+            raise UsageError(
+                f"{view.files[0]} has no frame number to put into {pattern}",
+                fix="number the files, as in room.0001.exr, or use {name}",
+            )
+        filled = sequences.numbered(pattern, view.frame)
     try:
-        return Path(pattern.format(name=source.stem, effect=effect))
+        return Path(filled.format(name=view.name, effect=effect))
     except (KeyError, IndexError, ValueError) as error:
         raise UsageError(
             f"the output pattern '{pattern}' can't be filled in: {error!r}",
-            fix="it may hold {name} and {effect}",
+            fix="it may hold {name} and {effect}, and #### or %04d for the frame",
         ) from error
 
 

@@ -1,8 +1,4 @@
-"""`deepshade-client`: shade pictures through a running service, and see what it offers.
-
-Exit codes: 0 all well, 1 some pictures failed, 2 wrong usage or input, 3 the service can't be
-reached or isn't ready, 130 interrupted.
-"""
+"""`deepshade-client`: shade pictures through a running service, and see what it offers."""
 
 from __future__ import annotations
 
@@ -14,36 +10,57 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from deepshade.cli import run
+from deepshade.cli import CONTEXT, Version, run
 from deepshade_client.exceptions import NotReady, TransportError
 from deepshade_client.settings import DEFAULT_SERVER
 
 app = typer.Typer(
-    help="Shade G-buffers through a running deepshade service.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    context_settings=CONTEXT,
 )
 
 Server = Annotated[
     str, typer.Option("--server", envvar="DEEPSHADE_SERVER", help="Address of the service.")
 ]
+EXIT_CODES = (
+    "Exit codes: 0 all is saved or was there, 1 some pictures failed, 2 wrong usage or input, "
+    "3 the service can't be reached or isn't ready, 130 interrupted (Ctrl-C)."
+)
 AsJson = Annotated[bool, typer.Option("--json", help="Machine-readable output on stdout.")]
 
 
-@app.command()
+@app.callback()
+def root(show_version: Version = False) -> None:
+    """Shade G-buffers through a running deepshade service.
+
+    Example: deepshade-client shade ao renders/*.exr -o shaded/ --radius 0.5
+    """
+
+
+@app.command(epilog=EXIT_CODES)
 def shade(
     effect: Annotated[
         str, typer.Argument(help="Which effect, as ao; or several, as ao,gi: a layer each.")
     ],
     inputs: Annotated[
-        list[str], typer.Argument(metavar="IN...", help="EXR files, folders, glob patterns.")
+        list[str],
+        typer.Argument(
+            metavar="IN...", help="EXR files, folders, patterns: 'a/*.exr', room.####.exr."
+        ),
     ],
     out: Annotated[
         str | None,
-        typer.Option("--out", "-o", help="A file, folder, or pattern with {name} and {effect}."),
+        typer.Option(
+            "--out",
+            "-o",
+            help="A file (.exr or .png), a folder, or a pattern with {name}, {effect}, or #### or "
+            "%04d for the frame.",
+        ),
     ] = None,
-    radius: Annotated[float | None, typer.Option(help="Effect radius, scene units.")] = None,
+    radius: Annotated[
+        str | None, typer.Option(help="Effect radius: scene units, or a share of the depth as 15%.")
+    ] = None,
     focus: Annotated[float | None, typer.Option(help="Distance in focus, scene units.")] = None,
     aperture: Annotated[float | None, typer.Option(help="Lens diameter, scene units.")] = None,
     shutter: Annotated[float | None, typer.Option(help="Open for so many frames.")] = None,
@@ -55,6 +72,10 @@ def shade(
     ] = None,
     up: Annotated[Literal["y", "z"] | None, typer.Option(help="The world's up axis.")] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    world_to_camera: Annotated[
+        str | None,
+        typer.Option(help="The camera's matrix: 16 numbers, row by row, for column vectors."),
+    ] = None,
     map_: Annotated[
         list[str] | None,
         typer.Option("--map", metavar="ATTR=CHANNEL", help="Where an attribute is; repeatable."),
@@ -97,13 +118,32 @@ def shade(
     explain: Annotated[
         bool, typer.Option("--explain", help="Print the plan as JSON; shade and save nothing.")
     ] = False,
-    png: Annotated[bool, typer.Option("--png", help="8-bit PNG instead of EXR.")] = False,
+    png: Annotated[
+        bool, typer.Option("--png", help="8-bit PNG instead of EXR, in a folder.")
+    ] = False,
     compression: Annotated[
         str | None, typer.Option(help="Of the EXR, as zip, piz or htj2k256.")
     ] = None,
     full: Annotated[bool, typer.Option("--float", help="32-bit pixels instead of 16.")] = False,
+    append: Annotated[
+        bool, typer.Option("--append", help="The input's own channels too, in the same EXR.")
+    ] = False,
+    layer: Annotated[str | None, typer.Option(help="Name of the answer's layer, as AO.")] = None,
+    multiply: Annotated[
+        bool, typer.Option("--multiply", help="The input's beauty times the answer.")
+    ] = False,
     together: Annotated[
-        bool, typer.Option("--together", help="All inputs are one view, one file per attribute.")
+        bool | None,
+        typer.Option(
+            "--together/--apart",
+            help="All inputs are one view, or each is its own; else by their names: "
+            "shot_normal.0001.exr and shot_depth.0001.exr are one frame.",
+            show_default=False,
+        ),
+    ] = None,
+    skip_existing: Annotated[
+        bool,
+        typer.Option("--skip-existing", help="Leave answers that are whole and newer than inputs."),
     ] = False,
     jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Requests in flight.")] = 3,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for an answer.")] = 600.0,
@@ -111,14 +151,23 @@ def shade(
     server: Server = DEFAULT_SERVER,
     as_json: AsJson = False,
 ) -> None:
-    """Shade pictures and save the answers; or, with --explain, say how that would be done."""
+    """Shade pictures and save the answers; or, with --explain, say how that would be done.
+
+    Examples:
+
+      deepshade-client shade ao renders/*.exr -o shaded/ --radius 0.5
+
+      deepshade-client shade ao,gi,dof room.exr -o room-shaded.exr --focus 3 --aperture 0.1
+
+      deepshade-client shade ao shot.exr --explain
+    """
     from deepshade.gbuffer.channels import parse_mapping
     from deepshade_client import batch, report
     from deepshade_client.client import AsyncClient, Client
     from deepshade_client.request import Options
     from deepshade_client.settings import Retry, Timeout
 
-    png = png or (out or "").lower().endswith(".png")
+    suffix = batch.suffix_of(out, png=png)
     options = Options(
         radius=radius,
         focus=focus,
@@ -128,6 +177,7 @@ def shade(
         rotate=rotate,
         up=up,
         fov=fov,
+        world_to_camera=world_to_camera,
         profile=profile,
         mapping=parse_mapping(map_ or []),
         axes=axes,
@@ -144,17 +194,20 @@ def shade(
         budget_ms=budget_ms,
         engine=engine,
         precision=precision,
-        format="png" if png else "exr",
+        format="png" if suffix == ".png" else "exr",
         compression=compression,
         half=False if full else None,
+        append=append or None,
+        layer=layer,
+        multiply=multiply or None,
     )
     retry, wait = Retry(attempts=retries + 1), Timeout(answer=timeout)
     if explain:
         with Client(server, retry=retry, timeout=wait) as client:
             plans = [
                 {
-                    "input": [str(path) for path in view],
-                    "plan": client.explain(effect, batch.together_or_one(view), options),
+                    "input": [str(path) for path in view.files],
+                    "plan": client.explain(effect, batch.picture_of(view.files), options),
                 }
                 for view in batch.views(inputs, together=together)
             ]
@@ -162,19 +215,30 @@ def shade(
         return
     if out is None:
         raise batch.UsageError("where shall the answers go?", fix="name a file or folder: --out")
-    tasks = batch.plan(
-        inputs, out, effect=effect, suffix=".png" if png else ".exr", together=together
-    )
+    tasks = batch.plan(inputs, out, effect=effect, suffix=suffix, together=together)
+    with report.progress(len(tasks), quiet=as_json) as bar:
+        found = report.Batch(tasks, bar, quiet=as_json)
+        found.open()
 
-    async def shade_all() -> list[batch.Result]:
-        async with AsyncClient(server, retry=retry, timeout=wait) as client:
-            with report.progress(len(tasks), quiet=as_json) as done:
-                return await batch.run(client, effect, tasks, options, jobs=jobs, done=done)
+        async def shade_all() -> None:
+            async with AsyncClient(
+                server, retry=retry, timeout=wait, waiting=found.waiting
+            ) as client:
+                await batch.run(
+                    client, effect, tasks, options, jobs=jobs, done=found.done, skip=skip_existing
+                )
 
-    results = asyncio.run(shade_all())
+        try:
+            asyncio.run(shade_all())
+            interrupted = False
+        except KeyboardInterrupt:
+            interrupted = True
+        found.close(interrupted=interrupted)
     if as_json:
-        _print_json(report.as_json(tasks, results))
-    failed = [result.error for result in results if result.error]
+        _print_json(found.as_json())
+    if interrupted:
+        raise typer.Exit(130)
+    failed = [result.error for result in found.results if result.error]
     if failed:
         unreached = all(isinstance(error, TransportError | NotReady) for error in failed)
         raise typer.Exit(3 if unreached else 1)
@@ -182,7 +246,10 @@ def shade(
 
 @app.command()
 def effects(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
-    """List the effects: their inputs, their settings with ranges, and the service's bundles."""
+    """List the effects: their inputs, their settings with ranges, and the service's bundles.
+
+    Example: deepshade-client effects --server http://farm:8000
+    """
     from deepshade_client.report import print_effects
 
     found = _effects(server)
@@ -198,7 +265,10 @@ def environments(
     server: Server = DEFAULT_SERVER,
     as_json: AsJson = False,
 ) -> None:
-    """List the environment maps of the service, and add some where it allows that."""
+    """List the environment maps of the service, and add some where it allows that.
+
+    Example: deepshade-client environments --add studio.hdr
+    """
     from deepshade_client.client import Client
     from deepshade_client.report import print_environments
     from deepshade_client.settings import Retry
@@ -212,7 +282,10 @@ def environments(
 
 @app.command()
 def models(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
-    """List the model bundles that the service has loaded."""
+    """List the model bundles that the service has loaded.
+
+    Example: deepshade-client models --json
+    """
     from deepshade_client.report import print_models
 
     found = [{"effect": e["name"], **bundle} for e in _effects(server) for bundle in e["bundles"]]

@@ -31,13 +31,15 @@ from deepshade_client.request import (
 from deepshade_client.settings import Retry, Timeout, default_server
 
 T = TypeVar("T")
+Waiting = Callable[[ClientError, float], None]
 
 
 class Client:
     """Talks to one service; may be shared by threads. Use it as a context manager, or `close` it.
 
     `server` defaults to $DEEPSHADE_SERVER, else http://127.0.0.1:8000. `transport` replaces the
-    network (see `MockTransport`). Every method raises ClientError.
+    network (see `MockTransport`). `waiting` hears of an error, and of the seconds until the next
+    attempt, each time that one follows. Every method raises ClientError.
     """
 
     def __init__(
@@ -47,9 +49,11 @@ class Client:
         timeout: Timeout | None = None,
         retry: Retry | None = None,
         transport: httpx.BaseTransport | None = None,
+        waiting: Waiting | None = None,
     ) -> None:
         self.server = (server or default_server()).rstrip("/")
         self._retry = retry or Retry()
+        self._waiting = waiting or (lambda error, seconds: None)
         self._http = httpx.Client(
             base_url=base_url(self.server),
             timeout=(timeout or Timeout()).as_httpx(),
@@ -150,6 +154,7 @@ class Client:
                 pause = self._retry.pause(error, attempt)
                 if pause is None:
                     raise
+                self._waiting(error, pause)
             time.sleep(pause)
 
 
@@ -163,9 +168,11 @@ class AsyncClient:
         timeout: Timeout | None = None,
         retry: Retry | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
+        waiting: Waiting | None = None,
     ) -> None:
         self.server = (server or default_server()).rstrip("/")
         self._retry = retry or Retry()
+        self._waiting = waiting or (lambda error, seconds: None)
         self._http = httpx.AsyncClient(
             base_url=base_url(self.server),
             timeout=(timeout or Timeout()).as_httpx(),
@@ -258,6 +265,7 @@ class AsyncClient:
                 pause = self._retry.pause(error, attempt)
                 if pause is None:
                     raise
+                self._waiting(error, pause)
             await asyncio.sleep(pause)
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
@@ -12,34 +15,81 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from rich.table import Table
 
 from deepshade_client.batch import Result, Task
-from deepshade_client.exceptions import ServerProblem
+from deepshade_client.exceptions import ClientError, ServerProblem
+from deepshade_client.sequences import summary
 
 
 @contextmanager
-def progress(total: int, *, quiet: bool) -> Iterator[Callable[[Result], None]]:
-    """A progress bar on stderr and a line for each picture; only errors if `quiet`."""
+def progress(total: int, *, quiet: bool) -> Iterator[Progress]:
+    """A progress bar on stderr; none if `quiet`, for one picture, or without a terminal."""
     console = Console(stderr=True)
     columns = ("shading", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     show = not quiet and total > 1 and console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=not show) as bar:
-        task = bar.add_task("", total=total)
-
-        def done(result: Result) -> None:
-            bar.advance(task)
-            if result.error:
-                _print_error(console, result)
-            elif not quiet:
-                console.print(_line(result), highlight=False, soft_wrap=True)
-
-        yield done
+        bar.add_task("", total=total)
+        yield bar
 
 
-def as_json(tasks: Sequence[Task], results: Sequence[Result]) -> dict[str, Any]:
-    """All results as one document, in the order of the tasks."""
-    by_task = {result.task: result for result in results}
-    pictures = [_entry(task, by_task.get(task)) for task in tasks]
-    saved = sum(picture["ok"] for picture in pictures)
-    return {"pictures": pictures, "saved": saved, "failed": len(tasks) - saved}
+@dataclass
+class Batch:
+    """What becomes of the tasks, on stderr: a line for each picture, only errors if `quiet`."""
+
+    tasks: Sequence[Task]
+    bar: Progress
+    quiet: bool
+    results: list[Result] = field(default_factory=list)
+    told: set[type] = field(default_factory=set)
+
+    def open(self) -> None:
+        """The first lines: which files are taken for one frame."""
+        for line in () if self.quiet else summary(task.sources for task in self.tasks):
+            self.bar.console.print(line, highlight=False, soft_wrap=True)
+
+    def done(self, result: Result) -> None:
+        """Says what came of one, and keeps it."""
+        self.results.append(result)
+        for task in self.bar.task_ids:
+            self.bar.advance(task)
+        if result.error:
+            _print_error(self.bar.console, result)
+        elif result.saved and not self.quiet:
+            self.bar.console.print(_line(result), highlight=False, soft_wrap=True)
+
+    def waiting(self, error: ClientError, seconds: float) -> None:
+        """Says, once for each kind of error, that there will be further attempts."""
+        if type(error) in self.told:
+            return
+        self.told.add(type(error))
+        _print_failure(self.bar.console, "[yellow]…[/yellow]", f"{error}; trying again", error)
+
+    def counts(self) -> dict[str, int]:
+        """How many were saved, failed, were skipped, and weren't tried."""
+        saved = sum(result.saved is not None for result in self.results)
+        failed = sum(result.error is not None for result in self.results)
+        done = len(self.results)
+        return {
+            "saved": saved,
+            "failed": failed,
+            "skipped": done - saved - failed,
+            "not_tried": len(self.tasks) - done,
+        }
+
+    def close(self, *, interrupted: bool = False) -> None:
+        """The last line: how many were saved and how many weren't, where there are several."""
+        counts = self.counts()
+        said = [f"{n} {kind.replace('_', ' ')}" for kind, n in counts.items() if n]
+        if interrupted:
+            said = ["interrupted", *said]
+        if not self.quiet and (len(self.tasks) > 1 or counts["skipped"]):
+            self.bar.console.print(", ".join(said), highlight=False)
+            if counts["not_tried"]:
+                self.bar.console.print("    the rest: the same command with --skip-existing")
+
+    def as_json(self) -> dict[str, Any]:
+        """All results as one document, in the order of the tasks."""
+        by_task = {result.task: result for result in self.results}
+        pictures = [_entry(task, by_task.get(task)) for task in self.tasks]
+        return {"pictures": pictures} | self.counts()
 
 
 def print_effects(effects: Sequence[dict[str, Any]]) -> None:
@@ -118,19 +168,38 @@ def _line(result: Result) -> str:
     derived = {value: None for name, value in facts.items() if name.endswith("derived") and value}
     if derived:
         parts.append(f"derived {escape('; '.join(derived))}")
+    if left := facts.get("left_out"):
+        parts.append(f"[yellow]not appended: {escape(left)}[/yellow]")
+    if multiplied := facts.get("multiplied"):
+        parts.append(f"multiplied onto {escape(multiplied)}")
     broken = {n for name, n in facts.items() if name.endswith("nonfinite_pixels")} - {"0"}
     if broken:
         parts.append(f"[yellow]{', '.join(sorted(broken))} non-finite pixels[/yellow]")
-    return "  ·  ".join(parts)
+    warnings = {value: None for name, value in facts.items() if name.endswith("warnings")}
+    lines = [f"\n    [yellow]{escape(as_options(text))}[/yellow]" for text in warnings]
+    return "".join(("  ·  ".join(parts), *lines))
+
+
+def as_options(text: str) -> str:
+    """The service's text with "--fov 50" for "?fov=50"."""
+
+    def option(parameter: re.Match[str]) -> str:
+        return f"--{parameter[1].replace('_', '-')}{' ' if parameter[2] else ''}"
+
+    text = re.sub(r"\?(strict|trust)=1", r"--\1", text)  # which take no value there
+    return re.sub(r"\?([a-z_]+)=(?=([\w<.])?)", option, text)
 
 
 def _print_error(console: Console, result: Result) -> None:
-    source = escape(str(result.task.sources[0]))
-    console.print(
-        f"[red]✗[/red] {source}: {escape(str(result.error))}", highlight=False, soft_wrap=True
-    )
-    if fix := getattr(result.error, "fix", ""):
-        console.print(f"    {escape(fix)}", highlight=False, soft_wrap=True)
+    assert result.error is not None
+    text = f"{result.task.sources[0]}: {result.error}"
+    _print_failure(console, "[red]✗[/red]", text, result.error)
+
+
+def _print_failure(console: Console, mark: str, text: str, error: Exception) -> None:
+    console.print(f"{mark} {escape(as_options(text))}", highlight=False, soft_wrap=True)
+    if fix := getattr(error, "fix", ""):
+        console.print(f"    {escape(as_options(fix))}", highlight=False, soft_wrap=True)
 
 
 def _entry(task: Task, result: Result | None) -> dict[str, Any]:
@@ -140,11 +209,24 @@ def _entry(task: Task, result: Result | None) -> dict[str, Any]:
         "ok": False,
     }
     if result is None:
-        return entry | {"error": {"detail": "not tried: the service can't be reached"}}
+        return entry | {"error": {"detail": "not tried: the batch ended early"}}
     entry["seconds"] = round(result.seconds, 4)
     if saved := result.saved:
-        facts = {"facts": dict(saved.facts), "milliseconds": dict(saved.timing)}
-        return entry | {"ok": True} | facts
+        facts = {name: number(name, fact) for name, fact in saved.facts.items()}
+        return entry | {"ok": True, "facts": facts, "milliseconds": dict(saved.timing)}
+    if result.error is None:
+        return entry | {"ok": True, "skipped": True}
     error = result.error
     document = error.document if isinstance(error, ServerProblem) else {"detail": str(error)}
     return entry | {"error": document}
+
+
+def number(name: str, fact: str) -> str | int | float:
+    """A header's number as one; names and hashes stay text, whatever they look like."""
+    if name.endswith(("bundle", "environment", "sha256")):
+        return fact
+    for kind in (int, float):
+        with suppress(ValueError):
+            if math.isfinite(number := kind(fact)):
+                return number
+    return fact

@@ -12,6 +12,8 @@ from typing import Any, Literal, TypeVar
 from urllib.parse import quote
 
 import httpx
+import numpy as np
+from numpy.typing import ArrayLike
 
 from deepshade_client.answer import Answer, Saved, facts, timing
 from deepshade_client.exceptions import (
@@ -39,7 +41,9 @@ class Options:
     """What a shading request may ask for; None leaves it to the service.
 
     `radius`, `focus` and `aperture` are in scene units, `shutter` in frames, `fov` is the full
-    horizontal angle in degrees, `mapping` says which layer or comma-separated channels hold an
+    horizontal angle in degrees. `radius` may be a share of the median depth, "15%", which it is
+    without one. `world_to_camera` is the camera's matrix (4, 4), for column vectors, or its numbers
+    row by row as text. `mapping` says which layer or comma-separated channels hold an
     attribute, `half` asks for 16-bit pixels. `environment` names the map that lights the scene,
     `rotate` turns it, in degrees, and `up` is the world's up axis.
 
@@ -48,12 +52,15 @@ class Options:
     where it needs them, and what to `derive` though it is there. `strict` makes warnings errors,
     `trust` skips the checks.
 
+    What the answer holds: with `append` the picture's own channels too, and the answer as a layer;
+    `layer` names that ("AO"); with `multiply` the picture's beauty times the answer.
+
     What shades: `quality` ("fast", "balanced", "best") or `bundle` by name; `max_error` (DSSIM)
     asks for the fastest within an error, `budget_ms` for the most accurate within a time of the
     network; `engine` ("openvino") and `precision` ("bf16") pin how it runs.
     """
 
-    radius: float | None = None
+    radius: float | str | None = None
     focus: float | None = None
     aperture: float | None = None
     shutter: float | None = None
@@ -61,6 +68,7 @@ class Options:
     rotate: float | None = None
     up: Literal["y", "z"] | None = None
     fov: float | None = None
+    world_to_camera: ArrayLike | str | None = None
     profile: str | None = None
     mapping: Mapping[str, str] | None = None
     axes: Sequence[str] | None = None
@@ -80,10 +88,16 @@ class Options:
     format: Literal["exr", "png"] | None = None
     compression: str | None = None
     half: bool | None = None
+    append: bool | None = None
+    layer: str | None = None
+    multiply: bool | None = None
 
     def query(self) -> list[tuple[str, str]]:
         """As the parameters of the request."""
-        plain = asdict(replace(self, mapping=None, axes=None, derive=None))
+        matrix = self.world_to_camera
+        if matrix is not None and not isinstance(matrix, str):
+            matrix = ",".join(f"{number:.17g}" for number in np.asarray(matrix, float).flat)
+        plain = asdict(replace(self, mapping=None, axes=None, derive=None, world_to_camera=matrix))
         mapped = [("map", f"{name}={where}") for name, where in (self.mapping or {}).items()]
         mapped += [("axes", axes) for axes in self.axes or ()]
         mapped += [("derive", name) for name in self.derive or ()]

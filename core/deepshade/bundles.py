@@ -6,7 +6,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ from typing import Any
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.environments import INPUTS
-from deepshade.errors import BundleError, nearest
-from deepshade.files import replacing, sha256
+from deepshade.errors import BundleError, ConfigError, nearest
+from deepshade.files import replacing, sha256, shipped
 from deepshade.tensors import channel_count
 
+SHIPPED = "shipped"  # as a folder of models: those that come with the program
 MODEL = "model.onnx"
 CONFIG = "config.json"
 METRICS = "metrics.json"
@@ -132,18 +133,48 @@ class Bundle:
         return bundle
 
 
-def bundle_root() -> Path:
-    """Where models are: $DEEPSHADE_MODELS, else ./models if it is there, else the sources' own."""
-    chosen = os.environ.get("DEEPSHADE_MODELS")
-    if chosen:
-        return Path(chosen)
+def bundle_roots(named: Sequence[Path | str] = ()) -> tuple[Path, ...]:
+    """The folders of models: those `named`, else $DEEPSHADE_MODELS, else the shipped ones.
+
+    The variable may hold several, as PATH does. SHIPPED among them stands for the shipped ones.
+    Raises ConfigError for one that isn't there.
+    """
+    variable = filter(None, os.environ.get("DEEPSHADE_MODELS", "").split(os.pathsep))
+    source = "--models" if named else "DEEPSHADE_MODELS"
+    roots = [
+        shipped("models") if str(place) == SHIPPED else Path(place)
+        for place in named or list(variable) or [SHIPPED]
+    ]
+    for root in roots:
+        if not root.is_dir():
+            detail = f"there is no folder {root}; {source} says where bundles are"
+            raise ConfigError("models", detail=f"{detail} ('{SHIPPED}': those that ship)")
+    return tuple(dict.fromkeys(roots))
+
+
+def overlooked(roots: Sequence[Path]) -> str:
+    """What to tell people who keep bundles in ./models and didn't name it; "" where they don't."""
     here = Path("models")
-    return here if here.is_dir() else Path(__file__).resolve().parents[2] / "models"
+    if any(root.resolve() == here.resolve() for root in roots) or not bundle_folders(here):
+        return ""
+    return f"the bundles in ./models aren't used; --models models --models {SHIPPED} uses them too"
 
 
-def bundle_folders(root: Path | str) -> list[Path]:
-    """The folder of every bundle under `root`/<effect>/<name>/, unverified, by effect and name."""
-    return [path.parent for path in sorted(Path(root).glob(f"*/*/{CONFIG}"))]
+def bundle_root() -> Path:
+    """The first of them."""
+    return bundle_roots()[0]
+
+
+def bundle_folders(*roots: Path | str) -> list[Path]:
+    """The folders of the bundles in <root>/<effect>/<name>/, unverified, by effect and name.
+
+    Of two with the same effect and name the one of the earlier root counts.
+    """
+    found: dict[tuple[str, str], Path] = {}
+    for root in roots:
+        for path in Path(root).glob(f"*/*/{CONFIG}"):
+            found.setdefault((path.parts[-3], path.parts[-2]), path.parent)
+    return [found[key] for key in sorted(found)]
 
 
 def write_config(path: Path | str, config: Mapping[str, Any], metrics: Mapping[str, Any]) -> Bundle:

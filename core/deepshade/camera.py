@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -127,7 +128,7 @@ class Camera:
 
     def _slopes(
         self, columns: NDArray[np.integer[Any]], rows: NDArray[np.integer[Any]]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
         """x / -z and y / -z of the stored pixels' centres."""
         scale = 1.0 / self.pixels_per_unit
         x = (columns + (self.x0 + 0.5 - 0.5 * self.width)) * scale + self.center[0]
@@ -203,6 +204,38 @@ def matrix_from_header(attributes: Mapping[str, Any]) -> NDArray[np.float64] | N
         raise CameraError("the header's worldToCamera is no 4 x 4 matrix") from None
     if matrix[3, :3].any() and not matrix[:3, 3].any():
         matrix = matrix.T  # pbrt writes it as it multiplies columns
+    return _checked_matrix(matrix)
+
+
+def parse_matrix(text: str) -> NDArray[np.float64]:
+    """worldToCamera (4, 4), for column vectors, of 16 numbers row by row, or of the first 12.
+
+    Between the numbers may stand blanks, commas, semicolons and brackets, as numpy, JSON and
+    Blender print a matrix. Raises CameraError for anything else.
+    """
+    words = re.split(r"[\s,;()\[\]]+", text.strip(" \t\r\n,;()[]"))
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 12:
+        numbers += [0, 0, 0, 1]
+    if len(numbers) != 16:
+        few = len(numbers) == 9
+        raise CameraError(
+            "a rotation alone doesn't say where the camera is"
+            if few
+            else f"worldToCamera must be 16 numbers, or the first 12, not '{text:.60}'",
+            fix="add the translation to each row"
+            if few
+            else "write its rows one after the other, with commas between the numbers",
+        )
+    matrix = np.reshape(numbers, (4, 4))
+    if not matrix[:3, 3].any() and matrix[3, :3].any() and matrix[3, 3] == 1:
+        raise CameraError(
+            "worldToCamera is transposed: its translation stands in the last row",
+            fix="write it as it multiplies column vectors, the translation in the last column",
+        )
     return _checked_matrix(matrix)
 
 

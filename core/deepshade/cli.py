@@ -6,15 +6,19 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points, version
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 import typer.core
 
 from deepshade.errors import DeepshadeError, nearest
-from deepshade.extras import extra_of
+from deepshade.extras import extra_of, install_command
 
 GROUP = "deepshade.commands"
+CONTEXT = {"help_option_names": ["-h", "--help"]}
+
+# shown in the commands' help; `run` answers it, after any subcommand too
+Version = Annotated[bool, typer.Option("--version", help="Print the version and exit.")]
 
 
 class Commands(typer.core.TyperGroup):
@@ -47,10 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def application() -> Any:
     """The command with all its subcommands."""
-    app = typer.Typer(
-        cls=Commands, add_completion=False, no_args_is_help=True, context_settings=_CONTEXT
-    )
-    app.callback(invoke_without_command=True)(_root)
+    app = typer.Typer(cls=Commands, no_args_is_help=True, context_settings=CONTEXT)
+    app.callback()(_root)
     return typer.main.get_command(app)
 
 
@@ -61,6 +63,9 @@ def run(command: Any, argv: Sequence[str] | None = None, *, name: str) -> int:
     130 for Ctrl-C, 141 when the reader of our output went away.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if "--version" in arguments:
+        print(f"deepshade {version('deepshade')}")
+        return 0
     try:
         result = command.main(args=arguments, prog_name=name, standalone_mode=False)
         sys.stdout.flush()
@@ -74,7 +79,7 @@ def run(command: Any, argv: Sequence[str] | None = None, *, name: str) -> int:
             raise
         _complain(
             f"this needs the '{extra}' extra (no module '{error.name}')",
-            f"pip install 'deepshade[{extra}]'",
+            install_command(extra),
         )
         return 2
     except KeyboardInterrupt:
@@ -98,19 +103,21 @@ def run(command: Any, argv: Sequence[str] | None = None, *, name: str) -> int:
         return int(code)
 
 
-def _root(
-    show_version: bool = typer.Option(
-        False, "--version", help="Print the version and exit.", is_eager=True
-    ),
-) -> None:
-    """Neural screen-space shading: a G-buffer in, shaded appearance out."""
-    if show_version:
-        typer.echo(f"deepshade {version('deepshade')}")
-        raise typer.Exit
+def _root(show_version: Version = False) -> None:
+    """Neural screen-space shading: a G-buffer in, shaded appearance out.
+
+    Examples:
+
+      deepshade doctor
+
+      deepshade serve
+
+      deepshade COMMAND --help
+    """
 
 
 def _command(point: EntryPoint) -> Any:
-    app = typer.Typer(add_completion=False, context_settings=_CONTEXT)
+    app = typer.Typer(add_completion=False, context_settings=CONTEXT)
     try:
         function = point.load()
     except (ImportError, AttributeError) as error:
@@ -134,8 +141,6 @@ def _complain(message: str, fix: str) -> None:
     if fix:
         print(f"  fix: {fix}", file=sys.stderr)
 
-
-_CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -13,8 +13,8 @@ from typing import Annotated
 
 import typer
 
-from deepshade.errors import BundleError
-from deepshade.extras import installed, missing_packages, packages
+from deepshade.errors import BundleError, ConfigError
+from deepshade.extras import install_command, installed, missing_packages, packages
 from deepshade.llvm import FIX as LLVM_FIX
 from deepshade.llvm import OLDEST, find_libllvm, libllvm_version
 from deepshade.machine import cpu_count, cpu_quota, memory_bytes
@@ -26,7 +26,7 @@ _GIB = 1024**3
 class Check:
     """One finding. A failed `required` check makes `deepshade doctor` exit with 1.
 
-    `fix` says what to do if it failed.
+    `fix` says what to do if it failed; `value` is what was counted or measured, in bytes or CPUs.
     """
 
     name: str
@@ -34,12 +34,22 @@ class Check:
     required: bool
     detail: str
     fix: str = ""
+    value: float | None = None
 
 
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Check this machine for everything deepshade needs, and print how to fix what is missing."""
+    """Check this machine for everything deepshade needs, and print how to fix what is missing.
+
+    Exits with 1 if something is missing that deepshade can't do without.
+
+    Examples:
+
+      deepshade doctor
+
+      deepshade doctor --json
+    """
     checks = run_checks()
     if json:
         import json as json_module
@@ -70,8 +80,7 @@ def check_packages() -> list[Check]:
         lacking = missing_packages(extra)
         name = f"extra '{extra}'" if extra else "core packages"
         detail = f"missing: {', '.join(lacking)}" if lacking else "all installed"
-        fix = f"pip install 'deepshade[{extra}]'" if extra else "pip install deepshade"
-        checks.append(Check(name, not lacking, not extra, detail, fix))
+        checks.append(Check(name, not lacking, not extra, detail, install_command(extra)))
     return checks
 
 
@@ -97,7 +106,8 @@ def check_shared_memory(path: Path = Path("/dev/shm")) -> list[Check]:
         return [Check("shared memory", True, False, "no /dev/shm on this system")]
     total = shutil.disk_usage(path).total
     fix = "docker run --shm-size=2g … (compose: shm_size: 2g)"
-    return [Check("shared memory", total >= _GIB, False, f"{total / _GIB:.1f} GiB in {path}", fix)]
+    detail = f"{total / _GIB:.1f} GiB in {path}"
+    return [Check("shared memory", total >= _GIB, False, detail, fix, total)]
 
 
 def check_machine() -> list[Check]:
@@ -108,7 +118,10 @@ def check_machine() -> list[Check]:
     enough = memory == 0 or memory >= 2 * _GIB
     detail = f"{memory / _GIB:.1f} GiB" if memory else "unknown"
     fix = "give the machine or container at least 2 GiB"
-    return [Check("CPUs", True, False, cpus), Check("memory", enough, False, detail, fix)]
+    return [
+        Check("CPUs", True, False, cpus, value=cpu_count()),
+        Check("memory", enough, False, detail, fix, memory or None),
+    ]
 
 
 def check_engines() -> list[Check]:
@@ -123,25 +136,31 @@ def check_engines() -> list[Check]:
     for backend in found:
         listed.setdefault(backend.engine, []).append(backend.precision)
     detail = "; ".join(f"{engine} ({', '.join(kinds)})" for engine, kinds in listed.items())
-    fix = "pip install 'deepshade[service]'"
+    fix = install_command("service")
     return [Check("engines", bool(found), installed("fastapi"), detail or "none", fix)]
 
 
-def check_bundles(root: Path | None = None) -> list[Check]:
-    """Whether each shipped model matches its hashes."""
-    from deepshade.bundles import Bundle, bundle_folders, bundle_root
+def check_bundles(*roots: Path) -> list[Check]:
+    """Whether each model that is served by default, or lies in `roots`, matches its hashes."""
+    from deepshade.bundles import Bundle, bundle_folders, bundle_roots
 
-    root = root or bundle_root()
-    checks = []
-    for folder in bundle_folders(root):
+    try:
+        roots = roots or bundle_roots()
+    except ConfigError as error:
+        fix = "name one that is there, or unset it to use the shipped ones"
+        return [Check("models", False, True, str(error), fix)]
+    checks = [Check("models", True, False, ", ".join(map(str, roots)))]
+    for folder in bundle_folders(*roots):
         name = f"model {folder.parent.name}/{folder.name}"
         try:
             detail = f"sha256 {Bundle.load(folder).short_hash}…"
             checks.append(Check(name, True, True, detail))
         except BundleError as error:
             checks.append(Check(name, False, True, str(error), error.fix))
-    nothing = Check("models", False, False, f"none in {root}", "deepshade export, or get models/")
-    return checks or [nothing]
+    if len(checks) == 1:
+        fix = "install deepshade again, or name a folder of bundles: DEEPSHADE_MODELS"
+        checks = [replace(checks[0], ok=False, detail=f"none in {checks[0].detail}", fix=fix)]
+    return checks
 
 
 def check_port(port: int = 8000) -> list[Check]:

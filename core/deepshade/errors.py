@@ -44,7 +44,10 @@ class LimitError(DeepshadeError):
 
 
 class MissingAttributeError(DeepshadeError):
-    """Attributes that an effect needs are neither in the image nor derivable from it."""
+    """Attributes that an effect needs are neither in the image nor derivable from it.
+
+    `enough` says from what less all of them could be derived, if that is so.
+    """
 
     def __init__(
         self,
@@ -53,14 +56,16 @@ class MissingAttributeError(DeepshadeError):
         near: Mapping[str, Sequence[str]] | None = None,
         *,
         why: Mapping[str, str] | None = None,
+        enough: str = "",
     ) -> None:
         near = {name: tuple(close) for name, close in (near or {}).items() if close}
         reasons = {name: f" ({why[name]})" for name in missing if why and why.get(name)}
         lacking = ", ".join(f"'{name}'{reasons.get(name, '')}" for name in missing)
         super().__init__(
             f"missing {lacking}; channels found: {_shortened(found) or 'none'}",
-            fix=_mapping_hint(missing, near),
+            fix=_mapping_hint(missing, near, enough),
         )
+        self.enough = enough
         self.missing = tuple(missing)
         self.found = tuple(found)
         self.near = near
@@ -137,8 +142,11 @@ def _shortened(names: Sequence[str]) -> str:
     return ", ".join(names[:24]) + (", …" if len(names) > 24 else "")
 
 
-def _mapping_hint(missing: Sequence[str], near: Mapping[str, Sequence[str]]) -> str:
+def _mapping_hint(
+    missing: Sequence[str], near: Mapping[str, Sequence[str]], enough: str = ""
+) -> str:
     for name in missing:
         if near.get(name):
             return f"if '{near[name][0]}' is it: --map {name}={near[name][0]}"
-    return f"render with that pass on, or name its channel: --map {missing[0]}=<layer>"
+    render = f"{enough}: render with that on" if enough else "render with that pass on"
+    return f"{render}, or name its channel: --map {missing[0]}=<layer>"

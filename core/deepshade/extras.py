@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
+import shutil
+import sys
 from functools import cache
-from importlib.metadata import requires
+from importlib.metadata import PackageNotFoundError, distribution, requires
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 # the first of these that brings a package is the one to install for it; the report borrows
 _ORDER = ("client", "service", "workers", "trainer", "report")
@@ -21,13 +27,19 @@ def packages() -> dict[str, tuple[str, ...]]:
 
     From the distribution's requirements (its pyproject.toml), without versions.
     """
-    found: dict[str, tuple[str, ...]] = dict.fromkeys(("", *_ORDER), ())
+    return {extra: tuple(each) for extra, each in _requirements().items()}
+
+
+@cache
+def _requirements() -> dict[str, dict[str, str]]:
+    """Extra -> its packages' names -> what pip is told, as "torch>=2.6"."""
+    found: dict[str, dict[str, str]] = {extra: {} for extra in ("", *_ORDER)}
     for requirement in requires("deepshade") or ():
         specifier, _, marker = requirement.partition(";")
         extra = re.search(r"extra == ['\"]([\w-]+)", marker)
         name = extra[1] if extra else ""
         if name in found and (package := re.match(r"[\w.-]+", specifier)):
-            found[name] += (package[0].lower(),)
+            found[name][package[0].lower()] = specifier.strip()
     return found
 
 
@@ -56,3 +68,37 @@ def extra_of(module: str) -> str | None:
         if any(top == module_of(package) for package in packages()[extra]):
             return extra
     return _INDIRECT.get(top)
+
+
+def install_command(extra: str) -> str:
+    """The line that installs an extra ("" for the core), from where this deepshade came.
+
+    That is the clone, or the wheel if it is where it was (PEP 610 keeps that). Else it names the
+    packages that are missing by their own names: an index may not have deepshade.
+    """
+    beside = Path(sys.executable).with_name("pip")
+    found = shutil.which("pip")
+    same = found is not None and Path(found).absolute() == beside.absolute()
+    return f"{'pip' if same else f'{sys.executable} -m pip'} install {_what(extra)}"
+
+
+def _what(extra: str) -> str:
+    suffix = f"[{extra}]" if extra else ""
+    clone = Path(__file__).resolve().parents[2]
+    if (clone / "pyproject.toml").is_file():
+        return f"-e '{'.' if clone == Path.cwd() else clone}{suffix}'"
+    url = _origin()
+    place = Path(url2pathname(urlsplit(url).path))
+    if url.startswith("file:") and place.exists():
+        return f"'{place}{suffix}'"
+    wanted = _requirements()[extra]
+    return " ".join(f"'{wanted[name]}'" for name in missing_packages(extra) or wanted)
+
+
+def _origin() -> str:
+    """The URL that this deepshade was installed from; "" from an index."""
+    try:
+        recorded = distribution("deepshade").read_text("direct_url.json")
+    except PackageNotFoundError:
+        return ""
+    return str(json.loads(recorded)["url"]) if recorded else ""

@@ -1,4 +1,4 @@
-"""Files that are either the old or the new version, never half of one; and their hashes."""
+"""Files that are the old or the new version, never half of one; their hashes; what ships."""
 
 from __future__ import annotations
 
@@ -28,6 +28,12 @@ def sha256(path: Path) -> str:
     """Hex digest of a file's bytes."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def shipped(kind: str) -> Path:
+    """The folder of what comes with the program, "models" or "samples": in the wheel or a clone."""
+    packed = Path(__file__).parent / "shipped" / kind
+    return packed if packed.is_dir() else Path(__file__).resolve().parents[2] / kind
 
 
 def _sync_folder(folder: Path) -> None:

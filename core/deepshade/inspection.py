@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from rich.console import Console
 
     from deepshade.exr import Limits
     from deepshade.gbuffer.conventions import Conventions
     from deepshade.gbuffer.plan import Plan
 
+SCENE_SUFFIXES = {".obj", ".ply", ".gltf", ".glb", ".stl", ".off", ".xml"}
+
 
 def inspect(
-    files: Annotated[list[Path], typer.Argument(help="EXR files of one view.")],
+    files: Annotated[
+        list[Path], typer.Argument(help="EXR files of one view, or scenes (GLB, glTF, OBJ, PLY …).")
+    ],
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
     map_: Annotated[
         list[str] | None,
@@ -39,16 +47,38 @@ def inspect(
     ] = None,
     near: Annotated[float | None, typer.Option(help="Depth of the near plane.")] = None,
     far: Annotated[float | None, typer.Option(help="Depth of the far plane.")] = None,
+    world_to_camera: Annotated[
+        str | None,
+        typer.Option(help="The camera's matrix: 16 numbers, row by row, for column vectors."),
+    ] = None,
 ) -> None:
-    """Show what EXR files hold, what it maps to, and what each effect still needs."""
+    """Show what EXR files hold, what it maps to, and what each effect still needs.
+
+    Of a scene: its box, units, objects, triangles, materials, and what is missing.
+
+    Examples:
+
+      deepshade inspect shot.exr
+
+      deepshade inspect shot_normal.exr shot_depth.exr --map normal=MyLayer.N --fov 40
+
+      deepshade inspect scene.glb
+    """
+    from deepshade.camera import parse_matrix
     from deepshade.gbuffer.channels import parse_mapping
     from deepshade.gbuffer.conventions import parse_conventions
 
+    if any(file.suffix.lower() in SCENE_SUFFIXES for file in files):
+        # By name, for the core imports no other part; without the extra, run() says so.
+        import_module("deepshade_workers.scenes.summary").inspect(files, as_json=json)
+        return
+    matrix = parse_matrix(world_to_camera) if world_to_camera else None
     report = inspect_files(
         files,
         mapping=parse_mapping(map_ or ()),
         profile=profile,
         fov=fov,
+        matrix=matrix,
         conventions=parse_conventions(axes or (), normals, depth, near, far),
     )
     if json:
@@ -67,14 +97,17 @@ def inspect_files(
     mapping: Mapping[str, str] | None = None,
     profile: str | None = None,
     fov: float | None = None,
+    matrix: NDArray[np.float64] | None = None,
     limits: Limits | None = None,
     conventions: Conventions | None = None,
 ) -> dict[str, Any]:
     """The report on files of one view, as plain JSON values.
 
     Keys: files (parts, channels, windows), profile, camera, mapped, ambiguous, effects (for each:
-    ready, have, derived, missing), statistics, and checks (derived, warnings, and the contradiction
-    with its fix, if there is one). Raises what `load_gbuffer` raises for files
+    ready, bundles, have, derived, missing), statistics, and checks (derived, warnings, and the
+    contradiction with its fix, if there is one). `matrix` is worldToCamera (4, 4), for column
+    vectors, in place of the header's. An effect is ready when a bundle of it is installed
+    whose inputs are there or can be derived. Raises what `load_gbuffer` raises for files
     that can't be read, but not for missing or ambiguous attributes: those are the report.
     """
     from deepshade import exr
@@ -82,10 +115,13 @@ def inspect_files(
     from deepshade.effects import EFFECTS
     from deepshade.gbuffer.plan import plan_gbuffer
 
-    limits = limits or exr.Limits()
+    limits, installed = limits or exr.Limits(), _installed()
     paths = [Path(file) for file in files]
     bodies = [exr.fetch(path, limits) for path in paths]
     headers = [exr.read_header(body, limits) for body in bodies]
+    if matrix is not None:
+        for part in (part for header in headers for part in header.parts):
+            part.attributes["worldToCamera"] = matrix.T
     stems, wanted = [path.stem for path in paths], list(ATTRIBUTES)
     plan = plan_gbuffer(headers, stems, wanted, profile=profile, mapping=mapping, fov=fov)
     return {
@@ -97,7 +133,10 @@ def inspect_files(
         },
         "mapped": {name: str(choice) for name, choice in plan.choices.items()},
         "ambiguous": {name: list(e.candidates) for name, e in plan.ambiguous.items()},
-        "effects": {name: _effect(plan, effect.inputs) for name, effect in EFFECTS.items()},
+        "effects": {
+            name: _effect(plan, effect.inputs, installed.get(name, {}))
+            for name, effect in EFFECTS.items()
+        },
         "statistics": _statistics(plan, bodies, limits),
         "checks": _checks(
             plan,
@@ -132,7 +171,34 @@ def _file(path: Path, header: Any) -> dict[str, Any]:
     }
 
 
-def _effect(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
+def _installed() -> dict[str, dict[str, list[str]]]:
+    """The inputs of every bundle here, unverified: effect -> bundle -> attributes."""
+    import json
+
+    from deepshade.bundles import CONFIG, bundle_folders, bundle_roots
+
+    found: dict[str, dict[str, list[str]]] = {}
+    for folder in bundle_folders(*bundle_roots()):
+        with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged one is none
+            config = json.loads((folder / CONFIG).read_text("utf-8"))
+            found.setdefault(config["effect"], {})[folder.name] = config["inputs"]
+    return found
+
+
+def _effect(
+    plan: Plan, inputs: Sequence[str], bundles: Mapping[str, Sequence[str]]
+) -> dict[str, Any]:
+    """What the bundle that lacks least has and lacks, or without one the effect itself."""
+    states = [_state(plan, names) for names in bundles.values() or [inputs]]
+    state = min(states, key=lambda each: len(each["missing"]))
+    return {
+        "ready": bool(bundles) and not state["missing"],
+        "bundles": sorted(bundles),
+        **state,
+    }
+
+
+def _state(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
     from deepshade.errors import AmbiguousChannelError, DeepshadeError
     from deepshade.gbuffer.suggestions import near_misses
 
@@ -152,7 +218,7 @@ def _effect(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
             derived |= {step.target: plan.how(step) for step in steps}
             if not steps:
                 have.append(name)
-    return {"ready": not missing, "have": have, "derived": derived, "missing": missing}
+    return {"have": have, "derived": derived, "missing": missing}
 
 
 def _checks(plan: Plan, sources: Sequence[tuple[str, bytes]], **how: Any) -> dict[str, Any]:
@@ -214,18 +280,9 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
 
     for file in report["files"]:
         console.print(f"[bold]{_safe(file['file'])}[/bold]  {file['bytes']:,} bytes")
-        table = Table("part", "size", "window", "frame", "compression", "channels")
         for index, part in enumerate(file["parts"]):
-            x0, y0, x1, y1 = part["data_window"]
-            table.add_row(
-                _safe(part["name"] or str(index)),
-                f"{x1 - x0 + 1} x {y1 - y0 + 1}",
-                "({}, {}) to ({}, {})".format(*part["data_window"]),
-                "({}, {}) to ({}, {})".format(*part["display_window"]),
-                part["compression"] + (" tiled" if part["tiled"] else ""),
-                _safe(", ".join(f"{name} {kind}" for name, kind in part["channels"].items())),
-            )
-        console.print(table)
+            name = f"{_safe(part['name'] or str(index))}: " if len(file["parts"]) > 1 else ""
+            console.print(f"  {name}{_size(part)}: {_safe(_listed(part['channels']))}")
     fov = report["camera"]["fov"]
     console.print(
         f"renderer: {report['profile'] or 'not recognised'}; "
@@ -233,10 +290,13 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
         f"worldToCamera: {'yes' if report['camera']['world_to_camera'] else 'no'}"
     )
 
-    table = Table("attribute", "channels", "non-finite", "values")
+    table = Table("attribute", "from", "non-finite", "values")
     for name, where in report["mapped"].items():
         row = report["statistics"].get(name, {})
         table.add_row(name, _safe(where), str(row.get("nonfinite", "")), _values(row))
+    derived = {n: how for each in report["effects"].values() for n, how in each["derived"].items()}
+    for name, how in derived.items():
+        table.add_row(name, how)
     for name, candidates in report["ambiguous"].items():
         table.add_row(name, f"[yellow]ambiguous:[/yellow] {_safe(', '.join(candidates))}")
     console.print(table)
@@ -250,20 +310,47 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
         console.print(f"[red]contradiction:[/red] {_safe(checks['contradiction']['detail'])}")
         console.print(f"  fix: {_safe(checks['contradiction']['fix'])}")
 
-    table = Table("effect", "state", "derived", "missing")
+    table = Table("effect", "state", "lacks")
     for name, effect in report["effects"].items():
-        missing = [
-            f"{attribute}: {_safe(facts['why'])}"
-            + (f"; near: {_safe(', '.join(facts['near']))}" if facts["near"] else "")
-            for attribute, facts in effect["missing"].items()
-        ]
-        table.add_row(
-            name,
-            "[green]ready[/green]" if effect["ready"] else "[red]missing[/red]",
-            "\n".join(f"{key} {how}" for key, how in effect["derived"].items()),
-            "\n".join(missing),
-        )
+        if effect["ready"]:
+            state = "[green]ready[/green]"
+        else:
+            state = "[red]missing[/red]" if effect["bundles"] else "[red]no bundle here[/red]"
+        table.add_row(name, state, _safe(_lacks(effect["missing"])))
     console.print(table)
+
+
+def _size(part: Mapping[str, Any]) -> str:
+    (x0, y0, x1, y1), frame = part["data_window"], part["display_window"]
+    text = f"{x1 - x0 + 1} x {y1 - y0 + 1}"
+    if part["data_window"] != frame or (x0, y0) != (0, 0):
+        text += (
+            f" at ({x0}, {y0}) of the frame ({frame[0]}, {frame[1]}) to ({frame[2]}, {frame[3]})"
+        )
+    return f"{text}, {part['compression']}{' tiled' if part['tiled'] else ''}"
+
+
+def _listed(channels: Mapping[str, str]) -> str:
+    """Channels by layer and type: "normal.X .Y .Z float; Z half"."""
+    layers: dict[tuple[str, str], list[str]] = {}
+    for name, kind in channels.items():
+        layer, dot, last = name.rpartition(".")
+        layers.setdefault((f"{layer}{dot}", kind), []).append(last)
+    return "; ".join(
+        f"{layer}{(' .' if layer else ' ').join(names)} {kind}"
+        for (layer, kind), names in layers.items()
+    )
+
+
+def _lacks(missing: Mapping[str, Any]) -> str:
+    """What is missing, in a line: what isn't there by name, of the rest what it needs."""
+    from deepshade.gbuffer.plan import ABSENT
+
+    absent = [name for name, facts in missing.items() if facts["why"] == ABSENT]
+    texts = [", ".join(absent)] if absent else []
+    texts += [f"{n}: {facts['why']}" for n, facts in missing.items() if n not in absent]
+    near = dict.fromkeys(each for name in absent for each in missing[name]["near"])
+    return "; ".join(texts) + (f" (near: {', '.join(near)})" if near else "")
 
 
 def _values(row: Mapping[str, Any]) -> str:

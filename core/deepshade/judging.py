@@ -81,6 +81,20 @@ def floor(effect: Effect, reference: Float, error: Float) -> float:
     return metrics.dssim(again, truth)
 
 
+def nothing_shown(effect: Effect, where: str, least: float) -> DataError:
+    """The error of a data set none of whose views shows `least`, with what to do."""
+    if effect.contrast == "deviation":
+        measure = "reference has a standard deviation"
+        fix = f"deepshade datagen --min-contrast {least:g}"
+    else:
+        measure = "trivial answer has a DSSIM"
+        fix = "other scenes, or more --views"
+    return DataError(
+        f"no view of {where} has enough contrast: of none the {measure} of {least:g} or more",
+        fix=f"render views that show more: {fix}, or see 'deepshade evaluate --min-contrast'",
+    )
+
+
 def contrast(effect: Effect, reference: Float, blank: Float) -> float:
     """How much a view shows, by the effect's measure: to be held against its `min_contrast`.
 

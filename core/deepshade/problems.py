@@ -33,8 +33,10 @@ _KINDS: tuple[tuple[type[DeepshadeError], int, str], ...] = (
     (BundleError, 500, "bad-bundle"),
     (DeepshadeError, 422, "unusable-input"),
 )
-_FACTS = ("missing", "found", "near", "attribute", "candidates", "seen", "fits")
-_FACTS += ("limit", "value", "maximum")
+_FACTS = (
+    *("missing", "found", "near", "attribute", "candidates", "seen", "fits"),
+    *("limit", "value", "maximum"),
+)
 MAX_ENTRIES = 200  # entries of a list; a file may have thousands of channels
 
 

@@ -57,14 +57,26 @@ def length_scale(effect: Effect, attributes: Mapping[str, Float], radius: float)
     """
     if effect.lengths == "radius":
         return radius
-    if "depth" in attributes:
-        depth = attributes["depth"][0, ::_STEP, ::_STEP]
-    elif "position" in attributes:
-        depth = -attributes["position"][2, ::_STEP, ::_STEP]
-    else:
-        return 1.0  # nothing of the effect is a length
-    depth = depth[np.isfinite(depth) & (depth > 0)]
-    return float(np.median(depth)) if depth.size else 1.0
+    return median_depth(attributes) or 1.0
+
+
+def median_depth(attributes: Mapping[str, Float]) -> float | None:
+    """The median of "depth" (1, H, W), else of "position" (3, H, W), where it shows a surface.
+
+    Of every eighth pixel each way, if any of those does. None where no surface is shown, or
+    neither attribute is there.
+    """
+    for step in (_STEP, 1):
+        if "depth" in attributes:
+            depth = attributes["depth"][0, ::step, ::step]
+        elif "position" in attributes:
+            depth = -attributes["position"][2, ::step, ::step]
+        else:
+            return None
+        depth = depth[np.isfinite(depth) & (depth > 0)]
+        if depth.size:
+            return float(np.median(depth))
+    return None
 
 
 def planes(

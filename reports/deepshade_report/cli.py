@@ -11,8 +11,9 @@ import typer
 def report(
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("out/report"),
     data: Annotated[
-        Path, typer.Option(help="Held-out views: a folder of 'deepshade datagen'.")
-    ] = Path("data/test-real"),
+        Path,
+        typer.Option(help="Held-out views: a folder of 'deepshade datagen', or of EXR files."),
+    ] = Path("samples"),
     models: Annotated[
         Path | None,
         typer.Option(help="Folder of bundles, <effect>/<name>/. Default: as 'deepshade serve'."),
@@ -37,9 +38,12 @@ def report(
 ) -> None:
     """Measure speed against error on this machine; write a page, plots and JSON.
 
-    About eight minutes on two cores. Ctrl-C keeps what is done: --resume goes on.
+    About eight minutes on two cores. Ctrl-C keeps what is done: --resume goes on. The samples of a
+    clone, the default, tell the speed; an error to be quoted needs a data set.
 
-      deepshade report --paper runs/paper-bundle/ao/paper
+      deepshade report --data data/test
+
+      deepshade report --data data/test-real --paper runs/paper-bundle/ao/paper
 
       deepshade report --only service --only sizes
     """
@@ -48,7 +52,7 @@ def report(
 
     from deepshade.bundles import bundle_root
     from deepshade.effects import EFFECTS
-    from deepshade.errors import ConfigError
+    from deepshade.errors import ConfigError, DataError
     from deepshade.machine import cpu_count
     from deepshade_report.context import Context
     from deepshade_report.report import SECTIONS, measure
@@ -74,7 +78,13 @@ def report(
         except KeyboardInterrupt:
             console.print(f"stopped; what is done is in {out}, and --resume goes on")
             raise
-    for name, section in found["sections"].items():
-        if section["status"] != "done":
-            typer.echo(f"skipped {name}: {section['reason']}", err=True)
+    skipped = [
+        f"{name}: {section['reason']}"
+        for name, section in found["sections"].items()
+        if section["status"] != "done"
+    ]
+    if len(skipped) == len(found["sections"]):
+        raise DataError(f"nothing could be measured: {'; '.join(skipped)}")
+    for line in skipped:
+        typer.echo(f"skipped {line}", err=True)
     typer.echo(f"{out / 'index.html'}")

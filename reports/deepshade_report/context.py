@@ -13,10 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from deepshade.bundles import Bundle, bundle_folders
-from deepshade.errors import ConfigError
+from deepshade.errors import ConfigError, DataError
+from deepshade.files import sha256
 from deepshade.machine import cpu_count, describe, memory_bytes
+from deepshade.manifest import NAME
+from deepshade.timing import Pace
 from deepshade_report.method import PAPER
-from deepshade_report.timing import Pace
+from deepshade_report.samples import sample_views
 from deepshade_report.view import View, load_views
 
 _QUALITIES = ("fast", "balanced", "best")  # of shipped bundles, which come first
@@ -67,9 +70,19 @@ class Context:
 
     @cached_property
     def views(self) -> list[View]:
-        """The held-out views that show something. Raises DataError without."""
+        """The held-out views that show something, or those of a folder of EXR files.
+
+        Raises DataError without.
+        """
         limit = self.max_views or (2 if self.quick else None)
-        return load_views(self.data, self.effect, limit)
+        if (self.data / NAME).is_file() or not any(self.data.glob("*.exr")):
+            return load_views(self.data, self.effect, limit)
+        if found := sample_views(self.data, self.effect)[:limit]:
+            return found
+        raise DataError(
+            f"no EXR file of {self.data} has a reference of '{self.effect}' that shows something",
+            fix=f"render one: deepshade render --effects {self.effect}, or datagen for many",
+        )
 
     def pace(self, seconds: float, *, min_rounds: int = 5, max_rounds: int = 25) -> Pace:
         """A section's time; quick reports take a tenth of it, and two rounds."""
@@ -85,7 +98,8 @@ class Context:
     def key(self) -> str:
         """Stamps sections: they are kept only for the same bundles, data, machine and settings."""
         hashes = [b.sha256 for b in (*self.served, self.paper_network) if b]
-        manifest = hashlib.sha256((self.data / "manifest.json").read_bytes()).hexdigest()
+        paths = [self.data / NAME] if (self.data / NAME).is_file() else self.data.glob("*.exr")
+        manifest = [sha256(path) for path in sorted(paths)]
         facts = machine(), hashes, manifest, self.threads, self.quick, self.max_views
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 

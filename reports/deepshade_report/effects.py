@@ -27,6 +27,7 @@ from deepshade_report.sections import Point, Sections, data, points
 from deepshade_report.sections.methods import methods, shaded
 from deepshade_report.strip import GAIN, chosen, strip, webp
 from deepshade_report.view import View
+from deepshade_trainer.card import record_speed
 
 WANTED = 32  # views that a mean should rest on
 DEFAULT = "balanced"  # the bundle that rivals are held against
@@ -208,6 +209,8 @@ def write(
             report: dict[str, Any] = measure(context, only=("error", "speed"), resume=resume)
             found[name] = figures = Figures(report["sections"])
             made[name] = fragment(context, figures, documents[0].parent / "images" / "effects")
+            if not context.quick:
+                _to_cards(context, figures)
         except DeepshadeError as problem:
             wrong[name] = str(problem)
             made[name] = f"Not measured: {problem}.\n"
@@ -217,6 +220,14 @@ def write(
         with replacing(document) as part:
             part.write_text(_MARKED.sub(lambda m: m[1] + made.get(m[2], "") + m[3], text), "utf-8")
     return wrong
+
+
+def _to_cards(context: Context, found: Figures) -> None:
+    """Our times, so that cards and pages say the same."""
+    for bundle in context.served:
+        points = [p for p in (*found.ours, found.alike) if p and p.name == bundle.name]
+        times = {point.backend: round(point.milliseconds, 2) for point in points}
+        record_speed(bundle, str(machine()["processor"]), times)
 
 
 def data_of(effect: str, folders: Sequence[Path]) -> Path:

@@ -143,10 +143,7 @@ def load_views(folder: Path, effect: str, limit: int | None = None) -> list[View
             if len(found) == limit:
                 return found
     if not found:
-        raise DataError(
-            f"no view of {folder} has a contrast of {row.min_contrast}",
-            fix="render views that show more: deepshade datagen --min-contrast",
-        )
+        raise judging.nothing_shown(row, str(folder), row.min_contrast)
     return found
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from deepshade import exr, pictures
 from deepshade.effects import EFFECTS
 from deepshade.gbuffer import GBuffer
+from deepshade_service.composition import Composition
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.plan import Facts, Json
 
@@ -66,7 +67,7 @@ class Shaded:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where an answer lies: EXR attributes of the camera, and the windows."""
+    """Where an answer lies: EXR attributes of the shot and the camera, and the windows."""
 
     attributes: Mapping[str, Any]
     data_window: exr.Window
@@ -75,35 +76,53 @@ class Place:
     @classmethod
     def of(cls, gbuffer: GBuffer) -> Place:
         """Where the G-buffer lies."""
-        return cls(gbuffer.placement(), gbuffer.data_window, gbuffer.display_window)
+        attributes = gbuffer.entries | gbuffer.placement()
+        return cls(attributes, gbuffer.data_window, gbuffer.display_window)
 
 
 def encode(
-    shades: Sequence[Float], made: Sequence[Made], place: Place, asked: ShadeParameters
+    shades: Sequence[Float],
+    made: Sequence[Made],
+    place: Place,
+    asked: ShadeParameters,
+    composition: Composition,
+    own: Mapping[str, Float],
 ) -> tuple[bytes, str]:
     """The answer's bytes and media type; each of several effects is a layer of its name.
 
-    Its header holds the facts and, as JSON, the plan of each.
+    Its header holds the facts and, as JSON, the plan of each. `own` are the channels of the
+    picture itself that go in; those of its beauty are multiplied in place.
     """
+    for name, factor in zip(
+        composition.beauty, np.broadcast_to(shades[0], (3, *shades[0].shape[1:])), strict=False
+    ):
+        np.multiply(own[name], factor, out=own[name], where=np.isfinite(own[name]))
+    if asked.format == "png" and composition.beauty:
+        beauty = np.stack([own[name] for name in composition.beauty])
+        return pictures.png(pictures.srgb(beauty)), "image/png"
     if asked.format == "png":
         return pictures.png(pictures.of_effect(shades[0], EFFECTS[made[0].effect])), "image/png"
-    channels: dict[str, Float] = {}
-    attributes = dict(place.attributes)
+    channels = dict(own)
+    attributes = {**composition.attributes, **place.attributes}
+    alone = f"{composition.layer}." if composition.layer else ""
     for shade, each in zip(shades, made, strict=True):
-        layer, key = (f"{each.effect}.", f"{each.effect}:") if len(made) > 1 else ("", "")
-        names = EFFECTS[each.effect].outputs
-        channels |= {f"{layer}{name}": plane for name, plane in zip(names, shade, strict=True)}
+        layer, key = (f"{each.effect}.", f"{each.effect}:") if len(made) > 1 else (alone, "")
+        names = EFFECTS[each.effect].outputs if composition.shade else ()
+        channels |= {f"{layer}{name}": plane for name, plane in zip(names, shade, strict=False)}
         attributes |= {f"deepshade:{key}{name}": value for name, value in each.facts.items()}
     if len(made) > 1:
         attributes["deepshade:effects"] = ",".join(each.effect for each in made)
     attributes["deepshade:plan"] = json.dumps(plan_of(made), separators=(",", ":"))
+    floats = {
+        name for name in channels if not (composition.own[name].half if name in own else asked.half)
+    }
     stream = io.BytesIO()
     exr.write(
         stream,
         channels,
         attributes=attributes,
         compression=asked.compression,
-        half=asked.half,
+        half=channels.keys() - floats,
         data_window=place.data_window,
         display_window=place.display_window,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
 from importlib.resources import files
@@ -13,16 +13,17 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request, Response
 from fastapi.responses import HTMLResponse, PlainTextResponse
+from fastapi_offline import FastAPIOffline
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
-from deepshade.effects import EFFECTS, SETTINGS, Effect, Setting
+from deepshade.effects import EFFECTS, SETTINGS, Setting
 from deepshade.engines import Engine
 from deepshade.errors import EngineError
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
+from deepshade_service import composition, problems
 from deepshade_service import environment_routes as routes
-from deepshade_service import problems
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
 from deepshade_service.environments import SHARE, Environments
@@ -35,7 +36,7 @@ from deepshade_service.shading import Shader
 from deepshade_service.telemetry import MEDIA_TYPE as METRICS_TYPE
 from deepshade_service.telemetry import Telemetry, server_timing
 from deepshade_service.uploads import Uploads
-from deepshade_service.workers import Cancelled, Workers
+from deepshade_service.workers import Cancelled, Workers, unless
 
 
 class Service:
@@ -53,8 +54,14 @@ class Service:
             environment_limits(settings.limits),
             int(SHARE * settings.memory),
         )
+        self.stopping = asyncio.Event()  # what is shaded then is finished, and no more is loaded
         self.shader = Shader(
-            self.models, self.workers, self.memory, settings.limits, self.environments
+            self.models,
+            self.workers,
+            self.memory,
+            settings.limits,
+            self.environments,
+            self.stopping,
         )
         self.telemetry = Telemetry(
             queued=lambda: self.workers.taken, held=lambda: self.uploads.held
@@ -77,13 +84,14 @@ class Service:
         effects = find_effects(names)
         candidates = [allowed(self.models, effect.name, asked) for effect in effects]
         asked.check(effects)
+        composition.check(asked, effects)
         if asked.environment is not None:
             self.environments.check(asked.environment)
         self.workers.check_place()  # before the body is received, to spare both sides the work
         async with self.uploads.receive(request) as files:
             with self.workers.place():
                 work = self.shader.shade(files, asked, candidates)
-                shaded = await _unless_gone(request, work)
+                shaded = await unless(_gone(request), Cancelled(), work)
         for made in () if asked.explain else shaded.made:
             shared = {name: ms / len(shaded.made) for name, ms in shaded.milliseconds.items()}
             nonfinite = int(made.facts["nonfinite_pixels"])
@@ -106,7 +114,8 @@ class Service:
 def create_app(settings: Settings | None = None) -> FastAPI:
     """The ASGI application for these settings."""
     service = Service(settings or Settings())
-    app = FastAPI(
+    app = FastAPIOffline(  # FastAPI, but /docs needs no internet
+        redoc_url=None,
         title="deepshade",
         version=version("deepshade"),
         summary="Neural screen-space shading: a G-buffer in, shaded appearance out.",
@@ -187,22 +196,6 @@ def _release(engines: list[Engine]) -> None:
     trim()
 
 
-async def _unless_gone(request: Request, work: Awaitable[Shaded]) -> Shaded:
-    """The work's result; if the client disconnects first the work is cancelled."""
-    job = asyncio.ensure_future(work)
-    gone = asyncio.ensure_future(_gone(request))
-    try:
-        await asyncio.wait({job, gone}, return_when=asyncio.FIRST_COMPLETED)
-        if not job.done():
-            raise Cancelled
-        return job.result()
-    finally:
-        for task in (job, gone):
-            task.cancel()
-            with suppress(asyncio.CancelledError, Exception):
-                await task
-
-
 async def _gone(request: Request) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
@@ -225,16 +218,13 @@ def _effect(name: str, models: Models) -> dict[str, Any]:
         "outputs": effect.outputs,
         "reference": effect.reference,
         "background": effect.background,
-        "settings": [_setting(s, models, effect) for s in SETTINGS.values() if effect.takes(s)],
+        "settings": [_setting(s) for s in SETTINGS.values() if effect.takes(s)],
         "bundles": [_bundle(bundle, models) for bundle in models.bundles(name)],
     }
 
 
-def _setting(setting: Setting, models: Models, effect: Effect) -> dict[str, Any]:
+def _setting(setting: Setting) -> dict[str, Any]:
     """Without it, what an image's `header` says counts, else the `default`."""
-    default = setting.default
-    if setting.name == "radius" and (bundles := models.bundles(effect.name)):
-        default = bundles[0].radius
     return {
         "name": setting.name,
         "unit": setting.unit,
@@ -242,7 +232,7 @@ def _setting(setting: Setting, models: Models, effect: Effect) -> dict[str, Any]
         "lowest": setting.lowest,
         "highest": setting.highest,
         "header": setting.header if setting.stored else None,
-        "default": default,
+        "default": setting.default,
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import socket
 from pathlib import Path
@@ -20,10 +21,11 @@ def serve(
     host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 8000,
     models: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
-            help="Folder of bundles, <effect>/<name>/. Default: $DEEPSHADE_MODELS, ./models, or"
-            " the models that came with the sources."
+            help="Folder of bundles, <effect>/<name>/, or 'shipped' for those that come with"
+            " deepshade; repeatable, the first that has a bundle counts. Default:"
+            " $DEEPSHADE_MODELS, else 'shipped'."
         ),
     ] = None,
     environments: Annotated[
@@ -68,21 +70,26 @@ def serve(
         LogLevel, typer.Option(case_sensitive=False, help="The least that is logged.")
     ] = "info",
 ) -> None:
-    """Serve the shaders over HTTP."""
+    """Serve the shaders over HTTP.
+
+    Examples:
+
+      deepshade serve
+
+      deepshade serve --port 9000 --models models --models shipped --environments maps
+    """
     from dataclasses import replace
 
-    from deepshade.bundles import bundle_root
+    from deepshade.bundles import bundle_roots, overlooked
     from deepshade.errors import ConfigError
     from deepshade.machine import cpu_count
     from deepshade_service.config import Settings, default_limits, default_memory
     from deepshade_service.memory import parse_size
     from deepshade_service.models import check_backend
 
-    models = models or bundle_root()
-    if not models.is_dir():
-        raise ConfigError(
-            "models", detail=f"there is no folder {models}; --models says where the bundles are"
-        )
+    roots = bundle_roots(models or ())
+    if note := overlooked(roots):
+        typer.echo(note, err=True)
     if environments is not None and not environments.is_dir():
         raise ConfigError("environments", detail=f"there is no folder {environments}")
     if engine or precision:
@@ -96,7 +103,7 @@ def serve(
     }
     uploads = parse_size(max_uploads) if max_uploads else 0
     settings = Settings(
-        models=models,
+        models=roots,
         environments=environments,
         environment_uploads=environment_uploads,
         engine=engine,
@@ -146,12 +153,14 @@ def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
     import uvicorn
 
     from deepshade_service.app import create_app
+    from deepshade_service.server import Server
 
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
     print(f"deepshade is serving at http://{shown}:{port} (Ctrl-C stops it)", flush=True)
+    app = create_app(settings)
     config = uvicorn.Config(
-        create_app(settings),
+        app,
         log_config=_logging(log_level),
         # Without it uvicorn waits for open sockets for ever.
         timeout_graceful_shutdown=max(1, round(settings.grace)),
@@ -161,7 +170,16 @@ def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
     # tidy, so they shall neither print a traceback nor turn a clean end into a failure.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)
-    uvicorn.Server(config).run(sockets=[listener])
+    Server(config, app.state.service).run(sockets=[listener])
+
+
+_POLLS = ("/healthz", "/readyz", "/metrics")
+
+
+def _no_poll(record: logging.LogRecord) -> bool:
+    """Whether a line of uvicorn's access log is about anything else than a health poll."""
+    _, _, path, *_ = record.args if isinstance(record.args, tuple) else ("", "", "")
+    return str(path).partition("?")[0] not in _POLLS
 
 
 def _logging(level: str) -> dict[str, Any]:
@@ -170,8 +188,12 @@ def _logging(level: str) -> dict[str, Any]:
 
     from uvicorn.config import LOGGING_CONFIG
 
-    logging = deepcopy(LOGGING_CONFIG)
+    config = deepcopy(LOGGING_CONFIG)
+    for formatter in config["formatters"].values():
+        formatter["fmt"] = f"%(asctime)s {formatter['fmt']}"
+    config["filters"] = {"polls": {"()": lambda: _no_poll}}
+    config["handlers"]["access"]["filters"] = ["polls"]
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "deepshade"):
-        logging["loggers"].setdefault(name, {"handlers": ["default"], "propagate": False})
-        logging["loggers"][name]["level"] = level.upper()
-    return logging
+        config["loggers"].setdefault(name, {"handlers": ["default"], "propagate": False})
+        config["loggers"][name]["level"] = level.upper()
+    return config

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from deepshade.bundles import bundle_root
+from deepshade.bundles import bundle_roots
 from deepshade.environments import LIMITS
 from deepshade.errors import ConfigError
 from deepshade.exr import Limits
@@ -50,7 +51,7 @@ class Settings:
     `memory` besides.
     """
 
-    models: Path = field(default_factory=bundle_root)
+    models: Path | Sequence[Path] = field(default_factory=bundle_roots)
     environments: Path | None = None
     environment_uploads: bool = False
     engine: str | None = None

@@ -12,7 +12,7 @@ from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS, SETTINGS, Effect, Setting
 from deepshade.errors import MissingAttributeError
 from deepshade.gbuffer import GBuffer, load_gbuffers
-from deepshade_service.parameters import LENS, ShadeParameters
+from deepshade_service.parameters import LENS, ShadeParameters, Share
 from deepshade_service.problems import Problem
 from deepshade_service.uploads import Upload
 
@@ -20,14 +20,17 @@ from deepshade_service.uploads import Upload
 def read_headers(
     files: Sequence[Upload], asked: ShadeParameters, limits: exr.Limits
 ) -> list[exr.Header]:
-    """The files' checked headers, in which the lens is the one asked for.
+    """The files' checked headers, in which lens and camera are those asked for.
 
     Raises what `exr.read_header` raises.
     """
     headers = [exr.read_header(file.data, limits) for file in files]
     lens = {SETTINGS[name].header: getattr(asked, name) for name in LENS}
+    said = {key: value for key, value in lens.items() if value is not None}
+    if (matrix := asked.matrix) is not None:
+        said["worldToCamera"] = matrix.T.astype(np.float32)  # Imath multiplies row vectors
     for part in (part for header in headers for part in header.parts):
-        part.attributes.update({key: value for key, value in lens.items() if value is not None})
+        part.attributes.update(said)
     return headers
 
 
@@ -59,6 +62,7 @@ def decode(
         headers=headers,
         anew=(*(name.value for name in asked.derive), *(("focal",) if new_lens else ())),
         conventions=asked.conventions,
+        radius=None if isinstance(asked.radius, Share) else asked.radius,
     )
     try:
         for bundle, gbuffer in zip(bundles, gbuffers, strict=True):
@@ -71,7 +75,9 @@ def decode(
             name: f"for {', '.join(effect for effect, names in needs.items() if name in names)}"
             for name in error.missing
         }
-        raise MissingAttributeError(error.missing, error.found, error.near, why=users) from None
+        raise MissingAttributeError(
+            error.missing, error.found, error.near, why=users, enough=error.enough
+        ) from None
 
 
 def _shuttered(gbuffer: GBuffer, effect: Effect, asked: ShadeParameters) -> GBuffer:

@@ -85,12 +85,17 @@ class Need:
 
 
 def need_of(
-    headers: Sequence[exr.Header], bundle: Bundle, total: int, beside: Sequence[Bundle] = ()
+    headers: Sequence[exr.Header],
+    bundle: Bundle,
+    total: int,
+    beside: Sequence[Bundle] = (),
+    more: int = 0,
 ) -> Need:
     """What shading these files takes of `total` bytes, by their headers alone.
 
     With other bundles `beside` it, one after the other, all attributes and answers are held
-    throughout. Raises LimitError when the total is too small even for the smallest tiles.
+    throughout, and `more` bytes. Raises LimitError when the total is too small even for the
+    smallest tiles.
     """
     bundles = {each.effect: each for each in (bundle, *beside)}
     outputs = sum(len(EFFECTS[effect].outputs) for effect in bundles)
@@ -99,7 +104,7 @@ def need_of(
     height, width = size_of(headers)
     # Throughout: the files, their channels as float32 with masks, the answers and their copies.
     pixel = 4 * channels + 4 + 12 * outputs
-    held = sum(header.body_bytes for header in headers) + pixel * width * height
+    held = sum(header.body_bytes for header in headers) + pixel * width * height + more
     # First strips of all channels as they are stored and what marks the background, then what
     # the inputs may be derived from, and after that, in the same room, the network.
     sources = 4 * channels * width * height

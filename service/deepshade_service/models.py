@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import OrderedDict
+from collections.abc import Sequence
 from pathlib import Path
 
 from deepshade.bundles import Bundle, bundle_folders
@@ -28,9 +29,13 @@ class Models:
     """
 
     def __init__(
-        self, root: Path, *, threads: int, pinned: tuple[str | None, str | None] = (None, None)
+        self,
+        roots: Path | Sequence[Path],
+        *,
+        threads: int,
+        pinned: tuple[str | None, str | None] = (None, None),
     ) -> None:
-        self.root = root
+        self.roots = (roots,) if isinstance(roots, Path) else tuple(roots)
         self.ready = False
         self.refused: list[str] = []
         self._threads = threads
@@ -46,20 +51,24 @@ class Models:
             log.error("the service stays unready: no engine is installed")
             return
         found: dict[str, dict[str, Bundle]] = {}
-        for folder in bundle_folders(self.root):
+        folders = bundle_folders(*self.roots)
+        for hidden in (f for root in self.roots for f in bundle_folders(root) if f not in folders):
+            log.warning("%s isn't served: a folder named before has that bundle too", hidden)
+        for folder in folders:
             label = f"{folder.parent.name}/{folder.name}"
             try:
                 bundle = await asyncio.to_thread(Bundle.load, folder)
             except (DeepshadeError, OSError) as error:
                 self.refused.append(label)
-                log.error("bundle %s is refused: %s", label, error)
+                log.error("bundle %s from %s is refused: %s", label, folder.parents[1], error)
                 continue
             found.setdefault(bundle.effect, {})[bundle.name] = bundle
-            log.info("bundle %s (%s) is verified", label, bundle.short_hash)
+            log.info("bundle %s (%s) from %s", label, bundle.short_hash, folder.parents[1])
         self._bundles = found
         self.ready = bool(found)
         if not found:
-            log.error("no usable bundle under %s: the service stays unready", self.root)
+            places = ", ".join(map(str, self.roots))
+            log.error("no usable bundle under %s: the service stays unready", places)
 
     def bundles(self, effect: str) -> list[Bundle]:
         """The bundles of one effect, the one with the least error first; [] while loading."""

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidatorFunctionWrapHandler,
+    WithJsonSchema,
+    field_validator,
+)
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
 
 from deepshade.attributes import ATTRIBUTES
+from deepshade.camera import parse_matrix
 from deepshade.effects import EFFECTS, SETTINGS, Effect
-from deepshade.errors import ConfigError
+from deepshade.effects.settings import MAX_LENGTH, MIN_LENGTH
+from deepshade.errors import CameraError, ConfigError
 from deepshade.exr import COMPRESSIONS
 from deepshade.gbuffer.channels import parse_mapping
 from deepshade.gbuffer.conventions import (
@@ -29,11 +42,24 @@ LENS = ("focus", "aperture")  # settings from which the blur circle is derived
 CAMERA = (*LENS, "shutter")
 LIGHT = ("environment", "rotate", "up")
 
+# what pydantic can't know: a percentage is read by a validator
+_RADIUS_SCHEMA = {
+    "anyOf": [
+        {"type": "number", "minimum": MIN_LENGTH, "maximum": MAX_LENGTH},
+        {"type": "string", "pattern": r"^[\d.]+%$"},
+        {"type": "null"},
+    ]
+}
+
 Compression = StrEnum("Compression", {name: name for name in COMPRESSIONS})  # type: ignore[misc]
 Normals = StrEnum("Normals", {name: name for name in ENCODINGS})  # type: ignore[misc]
 Depth = StrEnum("Depth", {name: name for name in KINDS})  # type: ignore[misc]
 Derivable = StrEnum("Derivable", {name: name for name in ATTRIBUTES})  # type: ignore[misc]
 Profile = StrEnum("Profile", {name: name for name in PROFILES})  # type: ignore[misc]
+
+
+class Share(float):
+    """A radius as a share of the picture's median depth: .1 for "10%"."""
 
 
 def _setting(name: str, instead: str = "") -> FieldInfo:
@@ -55,7 +81,11 @@ class ShadeParameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    radius: Annotated[float | None, _setting("radius", ", else the bundle's own")] = None
+    radius: Annotated[
+        float | None,
+        _setting("radius", ", else 15%: a percentage is of the picture's median depth"),
+        WithJsonSchema(_RADIUS_SCHEMA),
+    ] = None
     focus: Annotated[float | None, _setting("focus")] = None
     aperture: Annotated[float | None, _setting("aperture")] = None
     shutter: Annotated[
@@ -69,6 +99,14 @@ class ShadeParameters(BaseModel):
     up: Annotated[
         Literal["y", "z"] | None,
         Field(description="The world's up axis; else the one of the renderer, else `y`."),
+    ] = None
+    world_to_camera: Annotated[
+        str | None,
+        Field(
+            description="The camera's matrix, in place of the header's `worldToCamera`: 16 numbers"
+            " row by row, as it multiplies column vectors, so that every fourth is of the"
+            " translation; or the first 12. The camera looks down -z."
+        ),
     ] = None
     fov: Annotated[
         float | None,
@@ -177,6 +215,33 @@ class ShadeParameters(BaseModel):
     ] = "exr"
     compression: Annotated[Compression, Field(description="Of the EXR.")] = Compression("zip")
     half: Annotated[bool, Field(description="16-bit pixels in the EXR, else 32-bit.")] = True
+    append: Annotated[
+        bool,
+        Field(description="The picture's own channels too, and the answer as a layer beside them."),
+    ] = False
+    layer: Annotated[
+        str | None,
+        Field(
+            max_length=100,
+            description="The name of the answer's layer, as `AO`; with `append` else the effect's.",
+        ),
+    ] = None
+    multiply: Annotated[
+        bool,
+        Field(
+            description="The picture's beauty times the answer, in place of the answer alone."
+            " `map=beauty=…` says where it is, else its name (`Combined`, `rgba`, …) or R G B."
+        ),
+    ] = False
+
+    @field_validator("layer")
+    @classmethod
+    def _check_layer(cls, name: str | None) -> str | None:
+        if name is not None and not re.fullmatch(r"\w[\w.:-]*", name, re.ASCII):
+            raise ValueError(
+                f"'{name}' is no layer's name: letters, digits, _ . : and - may be in it"
+            )
+        return name
 
     @field_validator("map")
     @classmethod
@@ -204,6 +269,29 @@ class ShadeParameters(BaseModel):
         """
         checks: Checks = "trust" if self.trust else "strict" if self.strict else "usual"
         return parse_conventions(self.axes, self.normals, self.depth, self.near, self.far, checks)
+
+    @field_validator("radius", mode="wrap")
+    @classmethod
+    def _read_share(cls, value: object, number: ValidatorFunctionWrapHandler) -> object:
+        if isinstance(value, str) and value.rstrip().endswith("%"):
+            return Share(number(value.rstrip()[:-1]) / 100)
+        return number(value)
+
+    @field_validator("world_to_camera")
+    @classmethod
+    def _check_matrix(cls, text: str | None) -> str | None:
+        try:
+            if text is not None:
+                parse_matrix(text)
+        except CameraError as error:
+            why = "; ".join(filter(None, (str(error), error.fix)))
+            raise PydanticCustomError("matrix", "{why}", {"why": why}) from None
+        return text
+
+    @property
+    def matrix(self) -> NDArray[np.float64] | None:
+        """`world_to_camera` as (4, 4), for column vectors."""
+        return None if self.world_to_camera is None else parse_matrix(self.world_to_camera)
 
     @property
     def mapping(self) -> dict[str, str]:

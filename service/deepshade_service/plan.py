@@ -15,6 +15,7 @@ from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.environments import Environment, Up
 from deepshade.gbuffer import GBuffer
 from deepshade_service.parameters import CAMERA, ShadeParameters
+from deepshade_service.radius import Radius
 from deepshade_service.selection import Selection
 from deepshade_service.tiles import Tile
 
@@ -45,13 +46,12 @@ class Lighting:
 
 @dataclass(frozen=True, slots=True)
 class ShadePlan:
-    """What will be computed: at which radius (scene units), in which tiles, all of one `shape`.
+    """What will be computed: at which radius, in which tiles, all of one `shape`.
 
     `given` are the network's inputs beside the picture, of the lighting.
     """
 
-    radius: float
-    radius_source: str
+    radius: Radius
     shape: tuple[int, int]
     tiles: tuple[Tile, ...]
     lighting: Lighting | None = None
@@ -86,8 +86,8 @@ def explain(
         "precision": selection.backend.precision,
         "dssim": bundle.dssim,
         **_settings(gbuffer, bundle.effect, plan),
-        "derived": gbuffer.derived,
-        "warnings": list(gbuffer.warnings),
+        "derived": _derived(gbuffer, plan),
+        "warnings": [*gbuffer.warnings, *filter(None, [plan.radius.warning])],
         "pixels": {
             "width": width,
             "height": height,
@@ -114,7 +114,7 @@ def facts_of(gbuffer: GBuffer, plan: ShadePlan, made: Json) -> Facts:
     facts = {name: made.get(name) for name in (*names, *more)}
     return {name: fact for name, fact in facts.items() if fact is not None} | {
         "mapped": _listed(gbuffer.mapped),
-        "derived": _listed(gbuffer.derived),
+        "derived": _listed(made["derived"]),
         "background_pixels": made["pixels"]["background"],
         "nonfinite_pixels": int(gbuffer.nonfinite),
         "computed_pixels": plan.computed,
@@ -128,13 +128,19 @@ def _settings(gbuffer: GBuffer, effect: str, plan: ShadePlan) -> Json:
     known = EFFECTS[effect].settings
     found: Json = {}
     if "radius" in known:
-        found |= {"radius": plan.radius, "radius_source": plan.radius_source}
+        found |= {"radius": plan.radius.value, "radius_source": plan.radius.source}
     if plan.lighting is not None:
         found |= plan.lighting.facts()
     for name in CAMERA:
         if name in known and (value := gbuffer.header.get(SETTINGS[name].header)) is not None:
             found[name] = value if isinstance(value, float) else str(value)
     return found
+
+
+def _derived(gbuffer: GBuffer, plan: ShadePlan) -> dict[str, str]:
+    """How what wasn't there was found: the radius, and attributes."""
+    radius = {"radius": plan.radius.derived} if plan.radius.derived else {}
+    return radius | gbuffer.derived
 
 
 def _listed(entries: dict[str, str]) -> str:

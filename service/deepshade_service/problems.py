@@ -28,10 +28,7 @@ _OPTIONS = {
     "files": "--max-files",
     "memory_bytes": "--memory",
 }
-
-
-# Advice of the core package names options of commands: here they are parameters.
-_FLAG, _OPTION = re.compile(r"--(strict|trust)\b"), re.compile(r"--([a-z_]+) (<[^>]*>|\S+[^\s,;.])")
+_SWITCHES = ("strict", "trust")  # which commands take without a value
 
 
 class Problem(Exception):
@@ -55,8 +52,11 @@ class Problem(Exception):
         self.more = {"fix": fix, **more} if fix else more
 
 
-def from_error(error: DeepshadeError) -> Problem:
-    """The problem that an error of the core package is, with the facts that it carries."""
+def from_error(error: DeepshadeError, parameters: Collection[str]) -> Problem:
+    """The problem that an error of the core package is, with the facts that it carries.
+
+    Options of commands, which core names, are those of `parameters` here.
+    """
     status, kind = kind_of(error)
     fix = error.fix
     if isinstance(error, EngineError):  # what can't run here at all is refused before
@@ -64,8 +64,19 @@ def from_error(error: DeepshadeError) -> Problem:
     if isinstance(error, LimitError) and error.limit in _OPTIONS:
         option = _OPTIONS[error.limit]
         fix = f"send a smaller picture, or start the service with a higher {option}"
-    fix = _OPTION.sub(r"?\1=\2", _FLAG.sub(r"?\1=1", fix))
-    return Problem(status, kind, str(error), fix=fix, **facts_of(error))
+    detail = _as_query(str(error), parameters)
+    return Problem(status, kind, detail, fix=_as_query(fix, parameters), **facts_of(error))
+
+
+def _as_query(text: str, parameters: Collection[str]) -> str:
+    """The text with "?fov=50" for "--fov 50"."""
+
+    def query(option: re.Match[str]) -> str:
+        name = option[1].replace("-", "_")
+        value = "1" if name in _SWITCHES else ""
+        return f"?{name}={value}" if name in parameters else option[0]
+
+    return re.sub(r"--([a-z][a-z-]*)(?: (?=[\w<]))?", query, text)
 
 
 def respond(problem: Problem) -> JSONResponse:
@@ -93,7 +104,7 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
 
     @app.exception_handler(DeepshadeError)
     async def _(request: Request, error: DeepshadeError) -> JSONResponse:
-        problem = from_error(error)
+        problem = from_error(error, parameters)
         if problem.status >= 500:
             log.error("%s: %s", request.url.path, error)
         return respond(problem)
@@ -112,7 +123,7 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
         errors = [
             {
                 "where": ".".join(str(step) for step in entry["loc"]),
-                "problem": entry["msg"],
+                "problem": _said(entry),
                 "got": str(entry.get("input"))[:200],
             }
             for entry in error.errors()
@@ -134,12 +145,28 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
         )
 
 
+def _said(error: Mapping[str, Any]) -> str:
+    """What is wrong, where a bound is missed in as few digits as say it."""
+    if error["type"] == "extra_forbidden":
+        return "there is no such parameter"
+    context = error.get("ctx", {})
+    for bound, word in (("ge", "at least"), ("gt", "above"), ("le", "at most"), ("lt", "below")):
+        if isinstance(context.get(bound), int | float):
+            return f"must be {word} {context[bound]:g}, not {str(error.get('input'))[:40]}"
+    return str(error["msg"]).removeprefix("Value error, ")
+
+
 def _fix(error: Mapping[str, Any], parameters: Collection[str]) -> str:
     """The parameter that may have been meant, or the nearest value that it may have."""
     name = str(error["loc"][-1])
     if error["type"] == "extra_forbidden":
         close = nearest(name[:100], parameters)
         return f"did you mean ?{close}=?" if close else "/docs lists the parameters"
+    if error["type"] in ("literal_error", "enum"):
+        close = nearest(
+            str(error["input"])[:100], re.findall("'([^']+)'", error["ctx"]["expected"])
+        )
+        return f"did you mean ?{name}={close}?" if close else ""
     for bound in ("ge", "le"):
         if bound in (context := error.get("ctx", {})):
             return f"the nearest is ?{name}={context[bound]:g}"

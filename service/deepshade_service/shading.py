@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import threading
 from collections.abc import Iterator, Sequence
@@ -21,18 +22,20 @@ from deepshade.environments import Prepared
 from deepshade.gbuffer import GBuffer
 from deepshade.machine import trim
 from deepshade_service.answers import Made, Place, Shaded, encode, plan_of
-from deepshade_service.decoding import decode, read_headers, stored
+from deepshade_service.composition import Composition, bytes_of, compose
+from deepshade_service.decoding import decode, read_headers
 from deepshade_service.environments import DEFAULT, Environments
 from deepshade_service.memory import MemoryBudget, Need, need_of, size_of
 from deepshade_service.models import Models
 from deepshade_service.parameters import LIGHT, ShadeParameters
 from deepshade_service.plan import Lighting, ShadePlan, explain, facts_of
 from deepshade_service.problems import Problem
+from deepshade_service.radius import radius_of
 from deepshade_service.selection import Candidate, Selection, select
 from deepshade_service.telemetry import Stopwatch
 from deepshade_service.tiles import plan_tiles
 from deepshade_service.uploads import Upload
-from deepshade_service.workers import Cancelled, Workers
+from deepshade_service.workers import Cancelled, Workers, unless
 
 Float = NDArray[np.float32]
 
@@ -67,6 +70,7 @@ class Shader:
     memory: MemoryBudget
     limits: exr.Limits
     environments: Environments
+    stopping: asyncio.Event
 
     async def shade(
         self, files: list[Upload], asked: ShadeParameters, effects: list[list[Candidate]]
@@ -86,26 +90,33 @@ class Shader:
             made: list[Made] = []
             bundles = [job.bundle for job in jobs]
             gbuffers = decode(files, headers, bundles, asked, self.limits)
+            composition: Composition | None = None
             for job in jobs:
                 if cancelled.is_set():
                     raise Cancelled
                 with watch.time("decode"):
                     gbuffer = next(gbuffers)
                 place = Place.of(gbuffer)
+                if composition is None:
+                    effects = [EFFECTS[bundle.effect] for bundle in bundles]
+                    composition = compose(files, headers, asked, effects, gbuffer)
                 shade, how = run(job, gbuffer, headers, asked, held, cancelled)
                 shades.append(shade)
-                made.append(how)
+                made.append(replace(how, facts=how.facts | composition.facts))
                 del gbuffer  # the next may be decoded anew
             if asked.explain:
                 content = json.dumps(plan_of(made), indent=2).encode()
                 return Shaded(content, "application/json", made, watch.milliseconds)
             gbuffers.close()  # what they share is no longer needed
+            assert composition is not None, "there is at least one effect"
+            with watch.time("decode"):
+                own = composition.read(files, headers)
             with watch.time("encode"):
-                content, media_type = encode(shades, made, place, asked)
+                content, media_type = encode(shades, made, place, asked, composition, own)
             return Shaded(content, media_type, made, watch.milliseconds)
 
         headers = await self.workers.run(read)
-        jobs = await self._jobs(headers, asked, effects)
+        jobs = await unless(self.stopping.wait(), _stopping(), self._jobs(headers, asked, effects))
         held = max(job.need.total for job in jobs)
         async with self.memory.hold(held):
             return await self.workers.run(_giving_back(jobs, held)(work))
@@ -118,7 +129,8 @@ class Shader:
         jobs = []
         for selection in selections:
             bundle = selection.bundle
-            need = need_of(headers, bundle, self.memory.total, bundles)
+            more = bytes_of(headers, asked)
+            need = need_of(headers, bundle, self.memory.total, bundles, more)
             prepared = await self._environment(bundle, asked)
             engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
             jobs.append(Job(selection, need, prepared, engine))
@@ -171,6 +183,9 @@ def run(
         plan = plan_shading(gbuffer, bundle, asked, job.need.max_pixels)
         if job.prepared is not None:
             plan = lit(plan, job.prepared, gbuffer, bundle, asked)
+        if asked.strict and plan.radius.warning:
+            fix = "leave out ?strict=1 to have it shaded"
+            raise Problem(422, "contradiction", plan.radius.warning, fix=fix)
         made = explain(gbuffer, headers, job.selection, asked, plan, held)
         facts = facts_of(gbuffer, plan, made)
     shade = np.empty((0, 0, 0), np.float32)
@@ -186,18 +201,16 @@ def run(
 def plan_shading(
     gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters, max_pixels: int
 ) -> ShadePlan:
-    """What to compute, in tiles of at most `max_pixels`.
+    """What to compute, in tiles of at most `max_pixels`, all at the radius of the whole picture.
 
-    The radius is the one asked for, else the header's, else the bundle's. A tile that would only
-    answer background is left out, where the effect says what stands there. Raises Problem 422
-    for an impossible radius in the header.
+    A tile that would only answer background is left out, where the effect says what stands there.
+    Raises Problem 422 for an impossible radius in the header.
     """
-    radius, source = _radius(gbuffer, bundle, asked)
     grid = plan_tiles(*gbuffer.shape, bundle.size_multiple, bundle.halo, max_pixels)
     tiles = tuple(grid)
     if EFFECTS[bundle.effect].background != "shaded":
         tiles = tuple(tile for tile in tiles if not gbuffer.background[tile.answered].all())
-    return ShadePlan(radius, source, grid.shape, tiles)
+    return ShadePlan(radius_of(gbuffer, bundle, asked), grid.shape, tiles)
 
 
 def lit(
@@ -218,7 +231,7 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
     """
     bundle = engine.bundle
     effect = EFFECTS[bundle.effect]
-    scale = tensors.length_scale(effect, gbuffer.attributes, plan.radius)
+    scale = tensors.length_scale(effect, gbuffer.attributes, plan.radius.value)
     shade = np.empty((len(effect.outputs), *gbuffer.shape), np.float32)
     for channel in range(3) if bundle.per_channel else (None,):
         planes = tensors.planes(gbuffer.attributes, bundle.inputs, scale, channel=channel)
@@ -247,6 +260,16 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
     return shade
 
 
+def _stopping() -> Problem:
+    return Problem(
+        503,
+        "stopping",
+        "the service stops, and what this request needs was still being loaded",
+        fix="try again when it runs again",
+        headers={"Retry-After": "2"},
+    )
+
+
 @contextmanager
 def _giving_back(jobs: Sequence[Job], held: int) -> Iterator[None]:
     """Memory that the block leaves behind is given back if it was much."""
@@ -258,13 +281,3 @@ def _giving_back(jobs: Sequence[Job], held: int) -> Iterator[None]:
             for engine in engines:
                 engine.shrink()
             trim()
-
-
-def _radius(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> tuple[float, str]:
-    setting = SETTINGS["radius"]
-    if not EFFECTS[bundle.effect].takes(setting):
-        return bundle.radius, "bundle"
-    if asked.radius is not None:
-        return asked.radius, "request"
-    radius = stored(gbuffer, setting, "; ?radius= overrides it")
-    return (bundle.radius, "bundle") if radius is None else (radius, "header")

@@ -6,10 +6,10 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from deepshade_service.problems import Problem
 
@@ -21,6 +21,21 @@ _RUNS = 2  # of a job: one for its headers, one for its pixels
 
 class Cancelled(Exception):
     """The work was given up: its client went away, or the service stops."""
+
+
+async def unless(event: Coroutine[Any, Any, object], error: Exception, work: Awaitable[T]) -> T:
+    """The work's result; if `event` comes first the work is cancelled, and `error` raised."""
+    job, other = asyncio.ensure_future(work), asyncio.ensure_future(event)
+    try:
+        await asyncio.wait({job, other}, return_when=asyncio.FIRST_COMPLETED)
+        if not job.done():
+            raise error
+        return job.result()
+    finally:
+        for task in (job, other):
+            task.cancel()
+            with suppress(asyncio.CancelledError, Exception):
+                await task
 
 
 class Workers:

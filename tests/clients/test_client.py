@@ -101,6 +101,17 @@ def test_shade(server, make_exr, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out.exr", "view.exr"]
 
 
+def test_an_answer_in_words_is_short(server, make_exr):
+    with Client(server) as client:
+        answer = client.shade("ao", make_exr(64, 64), Options(radius=0.25))
+        layered = client.shade("ao", make_exr(8, 8), Options(append=True))
+    words = repr(answer)
+    assert len(words) < 120
+    for word in ("ao", "image/x-exr", f"{len(answer.content):,} bytes", "tiny", "0.25"):
+        assert word in words
+    np.testing.assert_array_equal(layered.arrays()["ao"], [layered.channels()["ao.Y"]])
+
+
 def test_explain_is_the_plan_of_the_answer(server, make_exr):
     options = Options(radius=0.25, bundle="tiny", engine="onnxruntime", precision="fp32")
     with Client(server) as client:

@@ -12,7 +12,7 @@ import time
 import pytest
 
 from deepshade import exr
-from deepshade_client import batch
+from deepshade_client import batch, report
 from deepshade_client.batch import UsageError, plan
 from deepshade_client.cli import main
 
@@ -124,15 +124,40 @@ def test_shade_one(run, views, tmp_path):
 def test_shade_a_folder_as_json(run, views, tmp_path):
     out, err = run("shade", "ao", views, "-o", tmp_path / "out", "--json", "--float", "-j", "2")
     assert err == ""
-    report = json.loads(out)
-    assert (report["saved"], report["failed"]) == (3, 0)
-    for entry, width in zip(report["pictures"], (4, 5, 6), strict=True):
+    document = json.loads(out)
+    assert (document["saved"], document["failed"]) == (3, 0)
+    for entry, width in zip(document["pictures"], (4, 5, 6), strict=True):
         assert entry["ok"]
         assert entry["facts"]["bundle"] == "tiny"
+        assert isinstance(entry["facts"]["radius"], float)
+        assert entry["facts"]["background_pixels"] == 0
+        assert isinstance(entry["facts"]["bundle_sha256"], str)
         assert set(entry["milliseconds"]) == {"decode", "plan", "infer", "encode"}
         part = exr.read_header(entry["output"]).parts[0]
         assert part.shape == (4, width)
         assert part.channels == {"Y": "float"}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "fact"),
+    [
+        ("tiles", "12", 12),
+        ("gi.radius", "1e-05", 1e-5),
+        ("bundle_sha256", "123456789012", "123456789012"),
+        ("ao.bundle", "7", "7"),
+        ("environment", "2024", "2024"),
+        ("dssim", "nan", "nan"),
+        ("derived", "position from depth", "position from depth"),
+    ],
+)
+def test_numbers_in_json_are_numbers_and_names_stay_names(name, text, fact):
+    assert report.number(name, text) == fact
+
+
+def test_every_help_has_an_example_and_every_command_a_version(run):
+    for name in ("shade", "effects", "environments", "models"):
+        assert f"deepshade-client {name} " in " ".join(run(name, "--help")[0].split())
+        assert run(name, "--version")[0].startswith("deepshade 0.")
 
 
 def test_explain_prints_the_plan_and_saves_nothing(run, views):
@@ -168,6 +193,99 @@ def test_png(run, views, tmp_path, option, name):
     assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("out", ["x.exr", "x.tif", "{name}.jpg"])
+def test_the_suffix_says_what_the_answer_is(run, views, tmp_path, out):
+    arguments = ["shade", "ao", views / "a.exr", "-o", tmp_path / out]
+    _, err = run(*arguments, "--png", code=2)
+    assert ("--png makes PNGs" if out == "x.exr" else "write .exr or .png") in err
+    assert not (tmp_path / out).exists()
+
+
+@pytest.fixture
+def frames(tmp_path, make_exr, make_picture):
+    """Three frames of two files each."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for name in ("normal", "position"):
+        channels = {k[-1]: v for k, v in make_picture(4, 6).items() if k.startswith(name)}
+        for frame in (1, 2, 3):
+            (folder / f"s_{name}.{frame:04d}.exr").write_bytes(make_exr(channels))
+    return folder
+
+
+def test_a_sequence_of_a_file_an_attribute(run, frames, tmp_path):
+    inputs = [frames / f"s_{name}.%04d.exr" for name in ("normal", "position")]
+    _, err = run("shade", "ao", *inputs, "-o", tmp_path / "ao.####.exr")
+    assert "s: 3 frames, 2 files a frame: normal, position" in err
+    assert "3 saved" in err
+    saved = sorted(path.name for path in tmp_path.glob("ao.*"))
+    assert saved == ["ao.0001.exr", "ao.0002.exr", "ao.0003.exr"]
+    assert exr.read_header(tmp_path / "ao.0002.exr").parts[0].shape == (4, 6)
+    (frames / "s_position.0002.exr").unlink()
+    _, err = run("shade", "ao", frames, "-o", f"{tmp_path}/out/", code=1)
+    assert "s_normal.0002.exr: there is no file of its position" in err
+    assert "2 saved, 1 failed" in err
+    out, _ = run("shade", "ao", frames / "s_*.0001.exr", "--explain")
+    assert [len(each["input"]) for each in json.loads(out)["pictures"]] == [2]
+    _, err = run("shade", "ao", frames, "-o", f"{tmp_path}/x/", "--apart", "--json", code=1)
+    assert err.count("✗") == 5  # each file alone is a G-buffer of nothing
+
+
+def test_what_is_done_is_skipped(run, frames, tmp_path):
+    arguments = ["shade", "ao", frames, "-o", f"{tmp_path}/out/", "--skip-existing"]
+    run(*arguments)
+    first, second, third = sorted((tmp_path / "out").iterdir())
+    made = {path: path.stat().st_mtime_ns for path in (first, second, third)}
+    first.write_bytes(first.read_bytes()[:-1])  # not whole
+    later = made[second] + 1
+    os.utime(frames / "s_position.0002.exr", ns=(later, later))
+    _, err = run(*arguments)
+    assert "2 saved, 1 skipped" in err
+    assert first.stat().st_mtime_ns > made[first]
+    assert second.stat().st_mtime_ns > made[second]
+    assert third.stat().st_mtime_ns == made[third]
+    _, err = run("shade", "ao", frames, "-o", f"{tmp_path}/png/", "--png")
+    _, err = run("shade", "ao", frames, "-o", f"{tmp_path}/png/", "--png", "--skip-existing")
+    assert "3 skipped" in err
+
+
+def test_a_sequence_has_one_radius(run, make_exr, make_picture, tmp_path):
+    for frame in (1, 2, 3):
+        picture = {name: frame * plane for name, plane in make_picture(4, 6).items()}
+        (tmp_path / f"s.{frame:04d}.exr").write_bytes(make_exr(picture))
+    out = tmp_path / "out.####.exr"
+
+    def radii(*options):
+        run("shade", "ao", tmp_path / "s.####.exr", "-o", out, *options)
+        headers = [exr.read_header(path) for path in sorted(tmp_path.glob("out.*"))]
+        return [header.parts[0].attributes["deepshade:radius"] for header in headers]
+
+    first = radii()[0]
+    assert radii() == [first] * 3
+    (tmp_path / "out.0003.exr").unlink()
+    assert radii("--skip-existing") == [first] * 3
+    assert len(set(radii("--radius", "15%"))) == 3
+
+
+def test_no_frame_number(run, views, tmp_path):
+    _, err = run("shade", "ao", views / "a.exr", "-o", tmp_path / "x.%04d.exr", code=2)
+    assert "a.exr has no frame number" in err
+
+
+def test_append_and_multiply(run, make_exr, make_picture, tmp_path):
+    shot, out = tmp_path / "shot.exr", tmp_path / "x.exr"
+    picture = make_picture(4, 6)
+    shot.write_bytes(make_exr(picture | {f"mine.{c}": picture["normal.Z"] for c in "RGB"}))
+    run("shade", "ao", shot, "-o", out, "--append", "--layer", "AO")
+    assert exr.read_header(out).parts[0].channels.keys() == {
+        *exr.read_header(shot).parts[0].channels,
+        "AO.Y",
+    }
+    _, err = run("shade", "ao", shot, "-o", out, "--multiply", "--map", "beauty=mine")
+    assert "multiplied onto mine.R, mine.G, mine.B" in err
+    assert exr.read_header(out).parts[0].channels.keys() == set("RGB")
+
+
 def test_together(run, make_exr, make_picture, tmp_path):
     for name in ("normal", "position"):
         channels = {k[-1]: v for k, v in make_picture(4, 4).items() if k.startswith(name)}
@@ -180,9 +298,9 @@ def test_together(run, make_exr, make_picture, tmp_path):
 def test_one_bad_picture_does_not_stop_the_others(run, views, tmp_path):
     (views / "b.exr").write_bytes(b"hello")
     out, err = run("shade", "ao", views, "-o", tmp_path / "out", "--json", code=1)
-    report = json.loads(out)
-    assert [entry["ok"] for entry in report["pictures"]] == [True, False, True]
-    assert report["pictures"][1]["error"]["status"] == 400
+    document = json.loads(out)
+    assert [entry["ok"] for entry in document["pictures"]] == [True, False, True]
+    assert document["pictures"][1]["error"]["status"] == 400
     assert "not an OpenEXR image" in err
     assert not (tmp_path / "out" / "b.exr").exists()
 
@@ -207,7 +325,12 @@ def test_nobody_there(run, views, tmp_path):
     out, err = run(*arguments, "--retries", "0", "--jobs", "1", "--json", code=3)
     errors = [entry["error"]["detail"] for entry in json.loads(out)["pictures"]]
     assert "can't connect" in errors[0]
-    assert errors[1] == errors[2] == "not tried: the service can't be reached"
+    assert errors[1] == errors[2] == "not tried: the batch ended early"
+    counts = {name: json.loads(out)[name] for name in ("saved", "failed", "skipped", "not_tried")}
+    assert counts == {"saved": 0, "failed": 1, "skipped": 0, "not_tried": 2}
+    _, err = run(*arguments, "--retries", "1", "--jobs", "1", code=3)
+    assert err.index("trying again") < err.index("✗")
+    assert "1 failed, 2 not tried" in err
     _, err = run("effects", "--server", "http://127.0.0.1:9", code=3)
     assert "deepshade serve" in err
 
@@ -216,7 +339,7 @@ def test_effects_and_models(run):
     out, _ = run("effects")
     assert "Ambient occlusion" in out
     assert "tiny" in out
-    for said in ("--radius", "scene units", "deepshade:radius, else 0.5", "--environment"):
+    for said in ("--radius", "scene units", "deepshade:radius, else 15%", "--environment"):
         assert said in " ".join(out.split())
     out, _ = run("models", "--json")
     (model,) = json.loads(out)
@@ -273,6 +396,8 @@ def test_ctrl_c_leaves_no_half_files(start, views, tmp_path):
     gate.set()
     assert process.returncode == 130
     assert "Traceback" not in err
+    assert "interrupted, 3 not tried" in err
+    assert "--skip-existing" in err
     assert not out.exists() or not list(out.rglob("*"))
 
 

@@ -2,11 +2,13 @@
 
 import hashlib
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 
-from deepshade.bundles import Bundle, bundle_folders, bundle_root, write_config
-from deepshade.errors import BundleError
+from deepshade.bundles import Bundle, bundle_folders, bundle_roots, overlooked, write_config
+from deepshade.errors import BundleError, ConfigError
 
 
 @pytest.fixture
@@ -68,12 +70,38 @@ def test_no_folder_holds_no_bundles(tmp_path):
 def test_where_models_are(tmp_path, monkeypatch):
     monkeypatch.delenv("DEEPSHADE_MODELS", raising=False)
     monkeypatch.chdir(tmp_path)
-    assert bundle_root().parts[-1] == "models"
-    assert (bundle_root().parent / "core").is_dir()
-    (tmp_path / "models").mkdir()
-    assert bundle_root().resolve() == tmp_path / "models"
-    monkeypatch.setenv("DEEPSHADE_MODELS", "/elsewhere")
-    assert str(bundle_root()) == "/elsewhere"
+    shipped = Path(__file__).resolve().parents[2] / "models"
+    assert bundle_roots() == (shipped,)
+    mine, others = tmp_path / "mine", tmp_path / "others"
+    for place in (mine, others):
+        place.mkdir()
+    assert bundle_roots([mine, "shipped"]) == (mine, shipped)
+    monkeypatch.setenv("DEEPSHADE_MODELS", f"{others}:shipped")
+    assert bundle_roots() == (others, shipped)
+    assert bundle_roots([mine]) == (mine,)
+    monkeypatch.setenv("DEEPSHADE_MODELS", "/nowhere")
+    with pytest.raises(ConfigError, match="/nowhere; DEEPSHADE_MODELS says"):
+        bundle_roots()
+
+
+def test_models_here_are_pointed_out_and_not_used(folder, monkeypatch):
+    monkeypatch.delenv("DEEPSHADE_MODELS", raising=False)
+    here = folder.parents[1]
+    monkeypatch.chdir(here.parent)
+    assert overlooked(bundle_roots()) == ""  # holds no bundle yet
+    make(folder)
+    assert "./models aren't used" in overlooked(bundle_roots())
+    assert overlooked([here]) == ""
+
+
+def test_of_two_bundles_of_one_name_the_folder_named_first_has_it(folder, tmp_path):
+    make(folder)
+    root, other = folder.parents[1], tmp_path / "other"
+    shutil.copytree(root, other)
+    shutil.copytree(folder, other / "ao" / "more")
+    more = other / "ao" / "more"
+    assert bundle_folders(root, other) == [folder, more]
+    assert bundle_folders(other, root) == [other / "ao" / "default", more]
 
 
 def test_a_run_for_each_colour_channel_sees_one_of_them(folder):

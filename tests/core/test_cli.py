@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from importlib.metadata import EntryPoint, version
+from pathlib import Path
 
 import pytest
 
@@ -29,9 +30,39 @@ def commands(monkeypatch):
     return install
 
 
-def test_version(capsys):
-    assert cli.main(["--version"]) == 0
+def where():
+    """How advice names this clone."""
+    clone = Path(__file__).resolve().parents[2]
+    return "." if clone == Path.cwd() else clone
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["serve", "--version"]])
+def test_version(arguments, capsys):
+    assert cli.main(arguments) == 0
     assert capsys.readouterr().out.strip() == f"deepshade {version('deepshade')}"
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("deepshade doc", "doctor"),
+        ("deepshade inspect --prof", "--profile"),
+        ("deepshade serve --log-level w", "warning"),
+    ],
+)
+def test_shells_complete_commands_options_and_values(words, offered, monkeypatch, capsys):
+    monkeypatch.setenv("_DEEPSHADE_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+    with pytest.raises(SystemExit):
+        cli.main([])
+    assert capsys.readouterr().out.split() == [offered]
+
+
+def test_every_help_has_an_example(capsys):
+    group = cli.application()
+    for name in group.list_commands(None):
+        assert f"deepshade {name} " in group.get_command(None, name).help, name
 
 
 def test_help_lists_every_installed_command(capsys):
@@ -56,7 +87,7 @@ def test_a_missing_extra_is_named(commands, capsys):
 
     commands(heavy=heavy)
     assert cli.main(["heavy"]) == 2
-    assert "pip install 'deepshade[trainer]'" in capsys.readouterr().err
+    assert f"pip install -e '{where()}[trainer]'" in capsys.readouterr().err
 
 
 def test_other_missing_modules_are_bugs(commands):

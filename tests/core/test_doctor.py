@@ -2,11 +2,12 @@
 
 import json
 import platform
+import re
 import socket
 
 import pytest
 
-from deepshade import doctor, machine
+from deepshade import doctor, extras, machine
 from deepshade.cli import main
 from deepshade.llvm import find_libllvm, libllvm_version
 
@@ -84,7 +85,7 @@ def test_engines_are_listed(monkeypatch):
     monkeypatch.setattr(engines, "available", lambda: ())
     (check,) = doctor.check_engines()
     assert not check.ok
-    assert "deepshade[service]" in check.fix
+    assert "[service]" in check.fix
 
 
 def test_a_taken_port_is_a_warning():
@@ -103,9 +104,32 @@ def test_a_broken_bundle_is_an_error(tmp_path):
     folder = tmp_path / "ao" / "default"
     folder.mkdir(parents=True)
     (folder / "config.json").write_text("{}")
-    (check,) = doctor.check_bundles(tmp_path)
+    place, check = doctor.check_bundles(tmp_path)
+    assert place.detail == str(tmp_path)
     assert check.required
     assert not check.ok
+
+
+def test_models_that_are_nowhere_are_an_error(monkeypatch):
+    monkeypatch.setenv("DEEPSHADE_MODELS", "/nowhere")
+    (check,) = doctor.check_bundles()
+    assert check.required
+    assert not check.ok
+    assert "/nowhere" in check.detail
+
+
+def test_what_was_counted_is_a_number():
+    values = {check.name: check.value for check in doctor.check_machine()}
+    assert values["CPUs"] == machine.cpu_count()
+    assert values["memory"] == machine.memory_bytes()
+
+
+def test_without_clone_and_wheel_advice_names_the_packages_themselves(monkeypatch):
+    monkeypatch.setattr(extras, "__file__", "/site/deepshade/extras.py")
+    monkeypatch.setattr(extras, "_origin", lambda: "")
+    monkeypatch.setattr(extras, "missing_packages", lambda extra: ["ray", "scipy"])
+    advice = extras.install_command("workers")
+    assert re.search(r"pip install 'ray\[default\]>=[\d.]+' 'scipy>=[\d.]+'$", advice)
 
 
 def test_every_failure_has_a_fix_of_one_line(monkeypatch):

@@ -288,6 +288,14 @@ def test_unwritten_chunks_are_noticed():
         exr.read_header(bytes(body))
 
 
+def test_pixels_that_cannot_be_decompressed_are_named_by_their_scanlines():
+    body = bytearray(encode({"Y": np.zeros((40, 20))}, compression="zip"))
+    body[-8:] = bytes(8)
+    with pytest.raises(DamagedImageError, match=r"damaged within scanlines \d+ to 39") as caught:
+        exr.read(bytes(body))
+    assert caught.value.fix
+
+
 def patched(name, kind, value, **settings):
     """A valid file with one header value overwritten."""
     body = bytearray(encode({"Y": plane()}, **settings))

@@ -43,6 +43,25 @@ def test_report(scene):
     assert json.loads(json.dumps(report)) == report
 
 
+def test_an_effect_is_ready_when_a_bundle_can_shade_it(scene, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "models" / "ao" / "mine"
+    folder.mkdir(parents=True)
+    config = {"effect": "ao", "inputs": ["normal", "position"]}
+    (folder / "config.json").write_text(json.dumps(config))
+    monkeypatch.setenv("DEEPSHADE_MODELS", str(tmp_path / "models"))
+    found = inspect_files([scene])["effects"]
+    assert (found["ao"]["ready"], found["ao"]["bundles"]) == (True, ["mine"])
+    assert [name for name, effect in found.items() if effect["ready"]] == ["ao"]
+    assert main(["inspect", str(scene)]) == 0
+    text = capsys.readouterr().out
+    assert "not there" not in text
+    assert "no bundle here" in text
+    config["inputs"] = ["normal", "light"]
+    (folder / "config.json").write_text(json.dumps(config))
+    ao = inspect_files([scene])["effects"]["ao"]
+    assert (ao["ready"], list(ao["missing"])) == (False, ["light"])
+
+
 def test_mapping_and_near_misses(scene):
     do = inspect_files([scene])["effects"]["do"]
     assert do["missing"]["normal_world"]["near"] == ["nornal"]

@@ -63,7 +63,7 @@ def test_mean_and_map_are_there_too(made):
     assert np.abs(between[inner] - environment.radiance[inner]).mean() < 0.05
 
 
-@pytest.mark.parametrize("height", [1, 3, 100, 512, 700, 2048])
+@pytest.mark.parametrize("height", [1, 3, 512, 700])
 def test_white_stays_white_at_any_size(height):
     table = prefilter(Environment("", np.full((3, height, 2 * height), 0.7, np.float32)))
     for index in range(len(TILES)):

@@ -53,6 +53,7 @@ def run(*options: str) -> tuple[int, str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(240)
+@pytest.mark.parametrize("root", ["gi"], indirect=True)
 def test_a_quick_report_has_every_section(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "folder", lambda effect: None)
     code, output = run(*arguments(root, "--quick"))
@@ -231,6 +232,7 @@ def test_the_page_stands_alone_and_escapes_what_was_measured(tmp_path: Path) -> 
     assert points(document["sections"])
 
 
+@pytest.mark.parametrize("root", ["ao"], indirect=True)
 @pytest.mark.parametrize("problem", [Skipped("no GPU"), DataError("no GPU"), OSError("no GPU")])
 def test_sections_are_kept_and_what_breaks_keeps_what_is_done(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, problem: Exception

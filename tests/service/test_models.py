@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 
 import pytest
@@ -265,3 +266,21 @@ def test_a_time_is_taken_while_warming_up(start, root, loads, make_exr):
     answer = local.client.post("/shade/ao?budget_ms=1e6", content=make_exr(8, 8), headers=EXR)
     assert answer.headers["deepshade-bundle"] == "best"
     assert sorted(loads) == ["balanced", "best", "fast"]
+
+
+def test_the_log_says_what_came_from_where_and_what_is_hidden(tmp_path, make_bundle, caplog):
+    for place in ("mine/ao/fast", "others/ao/fast", "others/ao/best"):
+        make_bundle(tmp_path / place)
+    models = Models((tmp_path / "mine", tmp_path / "others"), threads=1)
+    with caplog.at_level(logging.INFO, "deepshade.service"):
+        asyncio.run(models.load())
+    assert {bundle.path.parts[-3:] for bundle in models.bundles("ao")} == {
+        ("mine", "ao", "fast"),
+        ("others", "ao", "best"),
+    }
+    lines = [record.getMessage() for record in caplog.records]
+    assert f"{tmp_path / 'others' / 'ao' / 'fast'} isn't served" in lines[0]
+    assert [line.rpartition(" from ")[2] for line in lines[1:]] == [
+        str(tmp_path / "others"),
+        str(tmp_path / "mine"),
+    ]

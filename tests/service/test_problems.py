@@ -110,6 +110,45 @@ def test_bad_parameters(client, make_exr, query):
     assert name in document["detail"] or document["fix"] == "did you mean 'normal'?"
 
 
+@pytest.mark.parametrize(
+    ("query", "said"),
+    [
+        ("raduis=1", "did you mean ?radius=?"),
+        ("quality=bset", "did you mean ?quality=best?"),
+        ("profile=blendr", "did you mean ?profile=blender?"),
+        ("radius=-1", "must be at least 1e-30, not -1"),
+    ],
+)
+def test_near_misses_and_readable_bounds(client, make_exr, query, said):
+    document = problem(shade(client, make_exr(4, 4), f"?{query}"), 422, "bad-parameter")
+    assert said in f"{document['detail']}; {document['fix']}"
+
+
+def test_fixes_name_query_parameters_and_following_them_works(client, make_exr):
+    plane = np.full((8, 8), 3, "f")
+    body = make_exr({"Z": plane})
+    document = problem(shade(client, body), 422, "no-camera")
+    assert "(?fov=)" in document["fix"]
+    assert shade(client, body, "?fov=50").status_code == 200
+    document = problem(shade(client, make_exr({"A": plane})), 422, "missing-attribute")
+    assert "depth with the field of view (?fov=)" in document["fix"]
+    body = make_exr({f"{a}.normal.{c}": plane for a in "AB" for c in "XYZ"} | {"Z": plane})
+    document = problem(shade(client, body, "?fov=50"), 422, "ambiguous-channel")
+    query = document["fix"].partition(": ")[2]
+    assert shade(client, body, f"{query}&fov=50").status_code == 200
+
+
+def test_what_still_loads_when_the_service_stops_is_refused(start, make_exr):
+    local = start()
+
+    async def stop():
+        local.service.stopping.set()
+
+    local.run(stop())
+    document = problem(shade(local.client, make_exr(4, 4)), 503, "stopping")
+    assert "loaded" in document["detail"]
+
+
 def test_a_bad_radius_in_the_header(client, make_exr):
     body = make_exr(4, 4, attributes={"deepshade:radius": -2.0})
     problem(shade(client, body), 422, "bad-header")

@@ -36,7 +36,7 @@ def test_effects(client):
     assert bundle["times"] == []
     (radius,) = ao["settings"]
     assert (radius["name"], radius["unit"]) == ("radius", "scene units")
-    assert (radius["header"], radius["default"]) == ("deepshade:radius", 0.5)  # the bundle's own
+    assert (radius["header"], radius["default"]) == ("deepshade:radius", "15% of the median depth")
     by_name = {effect["name"]: effect for effect in effects}
     settings = {setting["name"]: setting for setting in by_name["full"]["settings"]}
     assert list(settings) == ["radius", "focus", "aperture", "environment", "rotate", "up"]
@@ -80,6 +80,7 @@ def test_schema_and_pages(client):
         "environment",
         "rotate",
         "up",
+        "world_to_camera",
         "fov",
         "profile",
         "map",
@@ -93,6 +94,9 @@ def test_schema_and_pages(client):
         "format",
         "compression",
         "half",
+        "append",
+        "layer",
+        "multiply",
     }
     assert names == wanted
     assert {"image/x-exr", "multipart/form-data"} <= set(post["requestBody"]["content"])
@@ -167,10 +171,9 @@ def test_a_taken_port_is_an_error_with_a_fix():
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_finish_requests_and_end_cleanly(start_server, make_exr, number):
     server = start_server()
-    body = make_exr(900, 900)
     results = []
 
-    def post():
+    def post(body):
         response = httpx.post(
             f"{server.url}/shade/ao",
             content=body,
@@ -180,7 +183,9 @@ def test_signals_finish_requests_and_end_cleanly(start_server, make_exr, number)
         )
         results.append(response.status_code)
 
-    thread = threading.Thread(target=post)
+    post(make_exr(4, 4))  # what Ctrl-C finds loading is given up
+    results.clear()
+    thread = threading.Thread(target=post, args=[make_exr(900, 900)])
     idle = httpx.Client(trust_env=False)
     idle.get(f"{server.url}/healthz")  # an open connection must not hold the end up
     thread.start()

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock
 from safetensors.numpy import save
 
 from deepshade.attributes import ATTRIBUTES, RADIANCE
-from deepshade.bundles import Bundle
+from deepshade.bundles import CONFIG, Bundle
 from deepshade.effects import EFFECTS
 from deepshade.environments import Environment
 from deepshade.environments.stored import store
@@ -114,7 +115,16 @@ def small(effect: str, name: str) -> Recipe:
 
 
 def make_bundle(effect: str, root: Path, name: str = "balanced") -> Bundle:
-    """`root`/<effect>/<name>: a bundle of an effect's preset, trained for one step."""
-    data, run = write_data(root / "data" / effect, effect), Run(root / "runs" / effect / name)
-    list(train(small(effect, name), [data], run))
-    return export(run, root / effect / name, [data], radius=RADIUS)[0]
+    """`root`/<effect>/<name>: a bundle of an effect's preset, trained for one step.
+
+    The run and the data are in `root`/runs and `root`/data. What another test made there, of this
+    process or another, is taken: to export some of these takes half a minute.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    with FileLock(root / f"{effect}-{name}.lock"):
+        folder, data = root / effect / name, root / "data" / effect
+        if not (folder / CONFIG).exists():
+            run = Run(root / "runs" / effect / name)
+            list(train(small(effect, name), [write_data(data, effect)], run))
+            export(run, folder, [data], radius=RADIUS)
+    return Bundle.load(folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,10 @@ from PIL import Image
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.cli import main
 from deepshade.machine import cpu_kind, describe
+from deepshade_trainer import training
+from deepshade_trainer.evaluation import short_names
+from deepshade_trainer.recipe import Recipe
+from deepshade_trainer.training import Progress
 
 SETTINGS = [
     "steps=4",
@@ -38,9 +43,13 @@ def test_train_export_evaluate(
     note = tmp_path / "note.md"
     note.write_text("Made by a test.")
     out = ["--out", str(bundle), "--data", str(data), "--test", str(data), "--note", str(note)]
+    assert main(["export", str(run), *out[:4]]) == 0
+    assert "Not measured" in (bundle / "README.md").read_text()
+    assert "--test" in capsys.readouterr().out
     assert main(["export", str(run), *out]) == 0
     assert [b.name for b in bundle_folders(tmp_path / "models")] == ["mine"]
     card = (bundle / "README.md").read_text()
+    assert "Not measured" not in card
     assert "Made by a test." in card
     assert "16-bit positions" in card
     errors = Bundle.load(bundle).metrics["error"]["waves"]
@@ -65,11 +74,30 @@ def test_train_export_evaluate(
     assert main([*evaluate, "--precision", "fp64"]) == 2
     assert "no precision 'fp64'" in capsys.readouterr().err
     assert main(evaluate) == 0
+    assert [view["view"] for view in document["views"]] == sorted({0, 1, 2})
     assert "x the trivial answer's" in capsys.readouterr().out
 
     other = ["--set", "lr=0.5", *settings]
     assert main(["train", "ao", "--data", str(data), "--out", str(run), *other]) == 2
     assert "another recipe" in capsys.readouterr().err
+
+
+def test_a_stopped_run_ends_with_130(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(recipe: Recipe, *_: object, **__: object) -> Iterator[Progress]:
+        yield Progress(3, recipe.steps, 0.5)
+
+    monkeypatch.setattr(training, "train", stopped)
+    assert main(["train", "ao", "--data", "x", "--out", "run", "--set", "steps=9"]) == 130
+    assert "step 3 of 9; the same command goes on" in capsys.readouterr().err
+
+
+def test_names_of_scenes_leave_out_the_folders_they_share() -> None:
+    assert short_names(["/a/b/c.obj", "/a/b/c.obj"]) == ["c.obj", "c.obj"]
+    assert short_names(["a/b/c.obj", "a/d/c.obj"]) == ["b/c.obj", "d/c.obj"]
+    assert short_names(["/a/b.obj", "procedural:room:7"]) == ["b.obj", "procedural:room:7"]
+    assert short_names(["compose:x/a+y/b:3", "c.obj"]) == ["compose:x/a+y/b:3", "c.obj"]
 
 
 @pytest.mark.parametrize(

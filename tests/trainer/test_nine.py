@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from deepshade import tensors
-from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.evaluation import evaluate
@@ -83,8 +82,9 @@ def test_batches_made_on_the_device_repeat(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "balanced"])
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_every_effect_trains_and_exports(effect: str, name: str, tmp_path: Path) -> None:
-    bundle = Bundle.load(make_bundle(effect, tmp_path, name).path)
+def test_every_effect_trains_and_exports(effect: str, name: str, made_once: Path) -> None:
+    root = made_once / name
+    bundle = make_bundle(effect, root, name)
     row = EFFECTS[effect]
     assert bundle.inputs == row.inputs
     assert bundle.outputs == row.outputs
@@ -92,7 +92,7 @@ def test_every_effect_trains_and_exports(effect: str, name: str, tmp_path: Path)
     assert bundle.per_channel == after.per_channel == (row.per_channel and not before.linear)
     names = before.state_dict().keys()
     assert names == after.network.state_dict().keys()
-    _, trained = load_shader(Run(tmp_path / "runs" / effect / name))
+    _, trained = load_shader(Run(root / "runs" / effect / name))
     for key, weight in trained.network.state_dict().items():
         assert torch.equal(weight, after.network.state_dict()[key]), key
     # an odd size, half of it empty, light up to 1e5
@@ -121,7 +121,7 @@ def test_every_effect_trains_and_exports(effect: str, name: str, tmp_path: Path)
     if bundle.per_channel:  # three runs at once are three single runs
         single = [running.run(None, {bundle.input_name: one[None]})[0][0] for one in gbuffer]
         assert np.abs(np.stack(single) - shade).max() <= 1e-5 * max(1, np.abs(shade).max())
-    rows = list(evaluate(bundle, [tmp_path / "data" / effect], limit=2))
+    rows = list(evaluate(bundle, [root / "data" / effect], limit=2))
     figures: dict[str, Any] = rows[0].figures
     assert all(np.isfinite(value) for value in figures.values())
     assert ("smape" in figures) == row.is_light

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import torch
 
 from deepshade.bundles import bundle_root
 from deepshade.errors import ConfigError, DataError
+from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.networks import from_bundle
 from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run
@@ -65,10 +67,10 @@ def test_a_run_starts_from_another_ones_average(data: Path, tmp_path: Path, reci
     list(train(recipe, [data], first))
     changed = {"steps": 1, "lr": 1e-9, "weight_decay": 0.0, "init_from": str(first.folder)}
     *down, last = recipe.network.down
-    (progress,) = train(
-        recipe.changed(network={"down": [*down, last + 1]}, **changed), [data], second
-    )
-    assert "encode" in progress.warning
+    start, _ = train(recipe.changed(network={"down": [*down, last + 1]}, **changed), [data], second)
+    assert "encode" in start.warning
+    assert start.step == 0
+    assert start.figures  # what it has to beat
     taken, given = weights(second), weights(first)
     assert set(given) < set(taken)
     for name, tensor in given.items():
@@ -87,6 +89,34 @@ def test_a_run_starts_from_a_bundle(data: Path, tmp_path: Path) -> None:
     assert given.keys() == taken.keys()
     for name, tensor in given.items():
         assert torch.allclose(taken[name], tensor, atol=1e-6), name
+
+
+def test_a_single_scene_is_validated_by_views(tmp_path: Path, recipe: Recipe) -> None:
+    folder = write_data(tmp_path / "one")
+    manifest = folder / "manifest.json"
+    manifest.write_text(re.sub(r"wave:\d+", "wave:0", manifest.read_text()))
+    found = Dataset([folder], "ao")
+    training, held = found.split(0.04, seed=0)
+    assert sorted(training + held) == list(range(24))
+    assert 1 <= len(held) <= 8
+    assert found.split(0.0, seed=0)[1] == []
+    steps = list(train(recipe.changed(val_fraction=0.04), [folder], Run(tmp_path / "run")))
+    assert f"{len(held)} of its 24 views" in steps[0].warning
+    assert steps[-1].figures
+
+
+def test_a_warm_up_longer_than_the_run_is_said(data: Path, tmp_path: Path, recipe: Recipe) -> None:
+    first = next(train(recipe.changed(warmup=7), [data], Run(tmp_path / "a")))
+    assert "warm-up of 7 steps is longer than the run of 6" in first.warning
+    assert "warm-up" not in next(train(recipe, [data], Run(tmp_path / "b"))).warning
+
+
+@pytest.mark.parametrize("device", ["cuda:99", "gpu", "cuda:x", "meta"])
+def test_a_device_that_is_not_there_is_refused(
+    device: str, data: Path, tmp_path: Path, recipe: Recipe
+) -> None:
+    with pytest.raises(ConfigError, match="device"):
+        next(train(recipe, [data], Run(tmp_path), device=device))
 
 
 def test_training_in_a_thread_leaves_signals_alone(
@@ -121,7 +151,9 @@ def test_a_killed_run_goes_on(data: Path, tmp_path: Path) -> None:
     settings += ["network.widths=[8,12]", "network.steps=[2]", "network.down=[1,1]"]
     settings += ["network.up=[1]", "network.rings=[1]", "network.fine_rings=[1]"]
     settings += ["network.detail=[]"]
-    command = [sys.executable, "-m", "deepshade.cli", "train", "ao", "--data", str(data)]
+    often = "from deepshade_trainer import training; training.SAVE_EVERY = 5; "
+    code = f"import sys; {often}from deepshade.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "train", "ao", "--data", str(data)]
     command += ["--threads", "1", "--out", str(out), *(x for s in settings for x in ("--set", s))]
     for _ in range(2):
         before = Run(out).load()[1] if Run(out).checkpoint.exists() else 0

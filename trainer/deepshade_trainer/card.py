@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from deepshade import bench
-from deepshade.bundles import Bundle, write_config
-from deepshade.effects import EFFECTS
+from deepshade.bundles import METRICS, Bundle, write_config
+from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.engines import usable
 from deepshade.files import replacing
 from deepshade.machine import cpu_kind, describe
@@ -19,6 +20,8 @@ from deepshade_trainer.evaluation import Variant, evaluate, summary
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
 
+# The section on speed, or where it belongs: before what follows the errors.
+_SPEED = re.compile(r"^## Speed\n.*?(?=^## |\Z)|(?=^## (?!Error))|\Z", re.MULTILINE | re.DOTALL)
 MAX_INT8_ADDED = 0.01  # of the DSSIM in fp32
 _WRITTEN = ("path", "metrics", "hashes")
 _COLUMNS = {"ssim": ".4f", "psnr": ".2f", "mae": ".4f", "flip": ".4f", "smape": ".4f"}
@@ -38,20 +41,24 @@ def variants(bundle: Bundle) -> dict[str, Variant]:
     return found
 
 
-def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
+def measure(
+    bundle: Bundle, folders: Sequence[Path], tell: Callable[[str], object] = lambda _: None
+) -> Bundle:
     """The bundle with errors over each test folder and this machine's speed in its metrics.
 
     `error` holds, for each folder, the summary under every variant of the inputs in fp32, and in
     the 16 and 8 bits of this machine. Where 8 bits add little error on all folders, they are
-    allowed on this kind of CPU.
+    allowed on this kind of CPU. `tell` hears what is being measured.
     """
     errors: dict[str, dict[str, Any]] = {folder.name: {} for folder in folders}
     for folder in folders:
         found = errors[folder.name]
         for name, variant in variants(bundle).items():
+            tell(f"measuring on {folder}: {name}")
             found[name] = summary(list(evaluate(bundle, [folder], variant=variant)))
         for backend in usable(bundle):
             if backend.precision != "fp32":
+                tell(f"measuring on {folder}: {backend}")
                 mean = summary(list(evaluate(bundle, [folder], backend=backend)))
                 found[f"exact, {backend}"] = mean
     kinds = set(bundle.int8_kinds) - {cpu_kind()}
@@ -63,6 +70,7 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
     ]
     if added and max(added) <= MAX_INT8_ADDED:
         kinds.add(cpu_kind())
+    tell("measuring its speed")
     speeds = {
         **bundle.metrics.get("speed", {}),
         describe(): {"size": [bench.WIDTH, bench.HEIGHT], "ms": bench.milliseconds(bundle)},
@@ -70,6 +78,23 @@ def measure(bundle: Bundle, folders: Sequence[Path]) -> Bundle:
     metrics = {**bundle.metrics, "error": errors, "speed": speeds}
     config = {f.name: getattr(bundle, f.name) for f in fields(bundle) if f.name not in _WRITTEN}
     return write_config(bundle.path, {**config, "int8_kinds": sorted(kinds)}, metrics)
+
+
+def record_speed(bundle: Bundle, machine: str, ms: Mapping[str, float]) -> None:
+    """Put a machine's milliseconds at 768 x 512, by backend, in place of what the bundle has.
+
+    In its metrics, and in its card, whose other sections stay.
+    """
+    path = bundle.path / METRICS
+    speed = {"size": [bench.WIDTH, bench.HEIGHT], "ms": dict(ms)}
+    metrics = {**bundle.metrics, "speed": {**bundle.metrics.get("speed", {}), machine: speed}}
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", "utf-8")
+    card = bundle.path / "README.md"
+    section = "\n".join([*speed_section(metrics), ""])
+    text = _SPEED.sub(lambda _: section, card.read_text("utf-8"), count=1)
+    with replacing(card) as temporary:
+        temporary.write_text(text, "utf-8")
 
 
 def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
@@ -80,7 +105,7 @@ def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
         "",
         f"Shades `{bundle.effect}` from {', '.join(bundle.inputs)}."
         + (
-            f" Lengths are divided by the effect radius ({bundle.radius:g} scene units unless the "
+            f" Lengths are divided by the effect radius ({SETTINGS['radius'].default} unless the "
             "request or the image's header names one), so any scene scale works."
             if effect.lengths == "radius"
             else " Lengths are divided by the picture's median depth."
@@ -94,7 +119,7 @@ def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
         else "Any size will do: a pixel depends on itself alone.",
         "",
         *_errors(bundle),
-        *_speeds(bundle),
+        *speed_section(bundle.metrics),
     ]
     if run is not None:
         recipe = Recipe.read(run.recipe)
@@ -110,7 +135,8 @@ def _errors(bundle: Bundle) -> list[str]:
     """Error over each test set under every variant, beside the trivial answer's."""
     errors: dict[str, dict[str, Any]] = bundle.metrics.get("error", {})
     if not errors:
-        return []
+        told = "Not measured: 'deepshade export' without --test, or no test view that counts."
+        return ["## Error", "", told, ""]
     effect = EFFECTS[bundle.effect]
     measures = {
         "deviation": "whose reference has a standard deviation of",
@@ -144,15 +170,15 @@ def _errors(bundle: Bundle) -> list[str]:
     return [*lines, ""]
 
 
-def _speeds(bundle: Bundle) -> list[str]:
+def speed_section(metrics: Mapping[str, Any]) -> list[str]:
     """The bare network's speed on each machine that it was measured on."""
-    speeds: dict[str, dict[str, Any]] = bundle.metrics.get("speed", {})
+    speeds: dict[str, dict[str, Any]] = metrics.get("speed", {})
     if not speeds:
         return []
     lines = [
         "## Speed",
         "",
-        "Milliseconds of the bare network.",
+        "Milliseconds of the bare network on a machine that does nothing else, warm, all channels.",
         "",
         "| machine | engine | precision | size | ms |",
         "|---|---|---|---|---|",

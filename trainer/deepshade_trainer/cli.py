@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from deepshade_trainer.training import Progress
 
 Effect = Annotated[str, typer.Argument(help="Effect to train, such as 'ao'.")]
 Data = Annotated[list[Path], typer.Option(help="Data folder of 'deepshade datagen'; repeatable.")]
@@ -26,18 +29,20 @@ def train(
     device: Annotated[str, typer.Option(help="'cpu' or 'cuda'.")] = "cpu",
     threads: Annotated[int, typer.Option(help="CPU threads; 0 for all.", min=0)] = 0,
 ) -> None:
-    """Train a shader. Ctrl-C saves and stops; the same command goes on.
+    """Train a shader. Ctrl-C saves and stops, with exit code 130; the same command goes on.
 
     Examples:
 
     deepshade train ao --data data/ao --out runs/ao
 
+    deepshade train ao --data data/mine --out runs/mine --set init_from=models/ao/balanced \
+--set steps=60 --set warmup=6 --set lr=0.0008
+
     deepshade train ao --data data/ao --out runs/paper --preset paper --set steps=6000
     """
     import torch
-    from rich import progress as bars
-    from rich.console import Console
 
+    from deepshade.console import Watch
     from deepshade_trainer.recipe import preset as load_preset
     from deepshade_trainer.run import Run
     from deepshade_trainer.training import train as steps
@@ -45,28 +50,29 @@ def train(
     if threads:
         torch.set_num_threads(threads)
     recipe = load_preset(preset, effect).changed(**_parse(settings or []))
-    console = Console(stderr=True)
-    columns = (
-        bars.TextColumn("training"),
-        bars.BarColumn(),
-        bars.MofNCompleteColumn(),
-        bars.TextColumn("{task.fields[loss]}"),
-        bars.TimeElapsedColumn(),
-        bars.TimeRemainingColumn(),
-    )
-    with bars.Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=recipe.steps, loss="")
+    done = recipe.steps  # a run that is complete yields nothing
+    with Watch("training", "steps") as watch:
         for progress in steps(recipe, data, Run(out), device=device):
-            bar.update(task, completed=progress.step, loss=f"loss {progress.loss:.4f}")
+            done = progress.step
             if progress.warning:
-                console.print(progress.warning, style="yellow")
+                watch.say(progress.warning, "yellow")
+            watch.update(done, recipe.steps, f"loss {progress.loss:.4f}" if done else "")
             if progress.figures:
-                console.print(
-                    f"step {progress.step}: loss {progress.loss:.4f}  held-out DSSIM "
-                    f"{progress.figures['dssim']:.4f} ({progress.figures['ratio']:.3f} x the "
-                    f"trivial answer's)  MAE {progress.figures['mae']:.4f}"
-                )
+                watch.say(_figures(progress))
     typer.echo(f"the run is in {out}")
+    if done < recipe.steps:
+        typer.echo(f"stopped at step {done} of {recipe.steps}; the same command goes on", err=True)
+        raise typer.Exit(130)
+
+
+def _figures(progress: Progress) -> str:
+    """A validation in a line."""
+    found = progress.figures or {}
+    loss = f"loss {progress.loss:.4f}  " if progress.step else ""
+    return (
+        f"step {progress.step}: {loss}held-out DSSIM {found['dssim']:.4f} "
+        f"({found['ratio']:.3f} x the trivial answer's)  MAE {found['mae']:.4f}"
+    )
 
 
 def evaluate(
@@ -102,9 +108,10 @@ def evaluate(
 
     from deepshade import pictures
     from deepshade.bundles import Bundle
+    from deepshade.console import stdout
     from deepshade.effects import EFFECTS
     from deepshade.engines import Backend
-    from deepshade_trainer.evaluation import Variant, contact_sheet, document, summary
+    from deepshade_trainer.evaluation import Variant, contact_sheet, document, short_names, summary
     from deepshade_trainer.evaluation import evaluate as measure
 
     found = Bundle.load(bundle)
@@ -121,22 +128,28 @@ def evaluate(
         typer.echo(json.dumps(document(found, rows, variant, backend)))
         return
     shown = ("ssim", "psnr", "mae", "flip", "dssim", "trivial_dssim")
-    listing = Table("scene", *shown)
-    for row in rows:
-        listing.add_row(row.scene, *(f"{row.figures[name]:.4f}" for name in shown))
+    listing = Table("view", "scene", *shown)
+    for row, scene in zip(rows, short_names([row.scene for row in rows]), strict=True):
+        figures = (f"{row.figures[name]:.4f}" for name in shown)
+        listing.add_row(str(row.number), scene, *figures)
     mean = summary(rows)
     listing.add_section()
-    listing.add_row(f"mean of {len(rows)}", *(f"{mean[name]:.4f}" for name in shown))
-    Console().print(listing)
+    listing.add_row("mean", f"of {len(rows)} views", *(f"{mean[name]:.4f}" for name in shown))
+    stdout().print(listing)
     typer.echo(f"DSSIM is {mean['ratio']:.3f} x the trivial answer's, on {backend}")
 
 
 def export(
-    run: Annotated[Path, typer.Argument(help="Run folder of 'deepshade train'.")],
-    out: Annotated[Path, typer.Option(help="Bundle folder, such as models/ao/balanced.")],
-    data: Annotated[
-        list[Path], typer.Option(help="Data whose G-buffers prove parity; repeatable.")
+    run: Annotated[
+        Path, typer.Argument(help="Run folder of 'deepshade train'; with --to, bundle folder.")
     ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Bundle folder, models/ao/balanced say; with --to any."),
+    ],
+    data: Annotated[
+        list[Path] | None, typer.Option(help="Data whose G-buffers prove parity; repeatable.")
+    ] = None,
     test: Annotated[
         list[Path] | None, typer.Option(help="Test data for the model card; repeatable.")
     ] = None,
@@ -144,12 +157,30 @@ def export(
         float, typer.Option(help="Effect radius of requests that name none, scene units.")
     ] = 1.0,
     note: Annotated[Path | None, typer.Option(help="Text that ends the model card.")] = None,
+    to: Annotated[str, typer.Option(help="'onnx': a bundle's graph for another program.")] = "",
+    size: Annotated[
+        str, typer.Option(help="With --to: WxH in pixels, such as 768x512, or dynamic.")
+    ] = "dynamic",
+    opset: Annotated[int, typer.Option(help="With --to: ONNX opset, 13 to 18.")] = 18,
 ) -> None:
     """Write a bundle, prove that ONNX Runtime equals torch, and measure it for its card.
 
     deepshade export runs/ao --out models/ao/balanced --data data/ao --test data/test
+
+    With --to, write a bundle's graph for a program of your own instead (docs/onnx.md):
+
+    deepshade export models/ao/fast --to onnx --size 768x512 -o graphs
     """
+    from functools import partial
+
     from deepshade.errors import ConfigError
+
+    if to:
+        _export_to(run, to, out, size, opset)
+        return
+    if not data:
+        raise ConfigError("data", detail="name the data that it was trained on: --data data/ao")
+
     from deepshade_trainer.card import measure, write_card
     from deepshade_trainer.export import export as write
     from deepshade_trainer.run import Run
@@ -159,10 +190,33 @@ def export(
     except OSError as error:
         raise ConfigError("note", detail=f"can't read {note}: {error.strerror}") from error
     bundle, worst = write(Run(run), out, data, radius=radius)
-    if test:
-        bundle = measure(bundle, test)
-    write_card(bundle, Run(run), ending)
+    write_card(bundle, Run(run), ending)  # a bundle has one, whatever its measurement meets
     typer.echo(f"{out}: sha256 {bundle.short_hash}, ONNX Runtime within {worst:.1e} of torch")
+    if test:
+        tell = partial(typer.echo, err=True)
+        write_card(measure(bundle, test, tell), Run(run), ending)
+    else:
+        typer.echo("not measured, as its card says: --test names views that it wasn't trained on")
+
+
+def _export_to(path: Path, to: str, folder: Path, size: str, opset: int) -> None:
+    """Write the bundle's graph to `folder` and say what it is made of."""
+    from deepshade.bundles import Bundle
+    from deepshade.errors import ConfigError
+    from deepshade_trainer.interchange import write_plain
+
+    if to != "onnx":
+        raise ConfigError("to", ["onnx"], detail=f"--to {to}: what there is is onnx")
+    width, _, height = size.partition("x")
+    if size != "dynamic" and not (width.isdecimal() and height.isdecimal()):
+        raise ConfigError("size", detail=f"--size {size}: give WxH, such as 768x512, or dynamic")
+    sides = None if size == "dynamic" else (int(width), int(height))
+    made = write_plain(Bundle.load(path), folder, sides, opset)
+    typer.echo(
+        f"{made.path}: {sum(made.operators.values())} nodes of {len(made.operators)} kinds, opset "
+        f"{opset}; ONNX Runtime's answers are within {made.difference:.0e} of the bundle's"
+    )
+    typer.echo(", ".join(f"{count} {name}" for name, count in made.operators.most_common()))
 
 
 def _parse(settings: list[str]) -> dict[str, Any]:

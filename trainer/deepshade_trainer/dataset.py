@@ -33,6 +33,8 @@ HALF_LENGTHS = 0.3
 # Shares of samples whose directions are too short, as interpolation and filtering leave them.
 SHORT_DIRECTIONS = 0.3
 MIN_DIRECTION = 0.8
+# Share of a single scene's views that are validated on, at least.
+HELD_VIEWS = 0.125
 
 
 @dataclass(frozen=True)
@@ -90,17 +92,27 @@ class Dataset:
                 ]
 
     def split(self, fraction: float, *, seed: int) -> tuple[list[int], list[int]]:
-        """Sample numbers to train on and to validate on; no scene is in both.
+        """Sample numbers to train on and to validate on; no scene is in both, if there are several.
 
         Scenes are held out by a hash of their name and the run's seed, so more data doesn't move
-        them; with a `fraction` above 0 at least one is, where there are two.
+        them; with a `fraction` above 0 at least one is. Of a single scene views are held out
+        alike, at least `HELD_VIEWS` of all.
         """
-        hashes = [_unit(f"{seed}:{entry.record['scene']}") for entry in self.entries]
+        names = [str(entry.record["scene"]) for entry in self.entries]
+        if self.one_scene:
+            names = [str(entry.record.get("seed", entry.name)) for entry in self.entries]
+            fraction = max(fraction, HELD_VIEWS) if fraction > 0 else 0.0
+        hashes = [_unit(f"{seed}:{name}") for name in names]
         if fraction > 0 and len(set(hashes)) > 1:
             fraction = max(fraction, float(np.nextafter(min(hashes), 1)))
         held = [value < fraction for value in hashes]
         training = [k for k, out in enumerate(held) if not out]
         return training, [k for k, out in enumerate(held) if out]
+
+    @property
+    def one_scene(self) -> bool:
+        """Whether all samples are of the same scene."""
+        return len({entry.record["scene"] for entry in self.entries}) == 1
 
     def load(self, number: int) -> Sample:
         """Sample `number`: planar float32 attributes in physical units, and its reference."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
@@ -53,6 +54,7 @@ class Variant:
 class Row:
     """One view's figures, and its images as they are compared, in [0, 1].
 
+    `number` is its place in the data, from 0: what tells views of one scene apart.
     `guide` shows its normals, or where the effect has none the trivial answer.
     """
 
@@ -62,6 +64,7 @@ class Row:
     image: Image
     reference: Image
     guide: pictures.Picture
+    number: int = 0
 
 
 @lru_cache(maxsize=8)  # about 75 MB each
@@ -150,15 +153,12 @@ def evaluate(
             if "normal" in sample
             else pictures.of_effect(nothing, effect)
         )
-        yield Row(entry.record["scene"], contrast, figures, ours, truth, guide)
+        yield Row(entry.record["scene"], contrast, figures, ours, truth, guide, number)
         found += 1
         if found == limit:
             return
     if not found:
-        raise DataError(
-            f"no sample has a contrast of {least}",
-            fix="render views that show more, or lower --min-contrast",
-        )
+        raise judging.nothing_shown(effect, ", ".join(map(str, folders)), least)
 
 
 def compare(image: Image, reference: Image, trivial: Image) -> dict[str, float]:
@@ -180,6 +180,13 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     names = [name for name in rows[0].figures if all(name in row.figures for row in rows)]
     mean = {name: float(np.mean([row.figures[name] for row in rows])) for name in names}
     return {"views": len(rows), **mean, "ratio": mean["dssim"] / mean["trivial_dssim"]}
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Scenes' names without the folders that all of them that are files share."""
+    files = [name for name in names if "/" in name and Path(name).suffix]
+    shared = os.path.commonpath([str(Path(name).parent) for name in files]) if files else ""
+    return [str(Path(n).relative_to(shared)) if n in files and shared else n for n in names]
 
 
 def contact_sheet(effect: Effect, rows: Sequence[Row], columns: int = 2) -> pictures.Picture:
@@ -212,5 +219,7 @@ def document(
         "precision": backend.precision,
         "inputs": asdict(variant),
         "mean": summary(rows),
-        "views": [{"scene": r.scene, "contrast": r.contrast, **r.figures} for r in rows],
+        "views": [
+            {"view": r.number, "scene": r.scene, "contrast": r.contrast, **r.figures} for r in rows
+        ],
     }

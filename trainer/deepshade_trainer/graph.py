@@ -37,20 +37,38 @@ def fold_constants(path: Path, target: Path) -> Any:
     names. The graph stays plain ONNX.
     """
     import onnx
-    import onnxruntime as ort
 
-    options = ort.SessionOptions()
-    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
-    options.optimized_model_filepath = str(target)
-    options.log_severity_level = 3
-    session(path, options, disabled_optimizers=_FUSIONS)
-    model = onnx.load(str(target))
-    plain = [entry for entry in model.opset_import if entry.domain == ""]
-    del model.opset_import[:]
-    model.opset_import.extend(plain)
+    model = fold(path, target)
     _shorten_names(model.graph)
     onnx.save(model, str(target))
     return model
+
+
+def fold(path: Path, target: Path) -> Any:
+    """The same, and every tensor keeps its name.
+
+    The exporter asks of some sizes, by `If`, whether they are 1, though its own shapes say so:
+    while there is one, sizes that are known become constants. With a picture of fixed size no
+    arithmetic on shapes is left.
+    """
+    import onnx
+    import onnxruntime as ort
+
+    while True:
+        options = ort.SessionOptions()
+        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        options.optimized_model_filepath = str(target)
+        options.log_severity_level = 3
+        session(path, options, disabled_optimizers=_FUSIONS)
+        model = onnx.load(str(target))
+        plain = [entry for entry in model.opset_import if entry.domain == ""]
+        del model.opset_import[:]
+        model.opset_import.extend(plain)
+        asks = any(node.op_type == "If" for node in model.graph.node)
+        if not asks or not _known_sizes(model):
+            return model
+        onnx.save(model, str(target))
+        path = target
 
 
 def float32_marks(model: Any, rounded: str = "") -> tuple[list[str], list[str]]:
@@ -188,6 +206,31 @@ def int8_ranges(
             low[each] = min(low[each], float(value.min()))
             high[each] = max(high[each], float(value.max()))
     return {node.input[1]: (low[node.input[0]], high[node.input[0]]) for node in inner}
+
+
+def _known_sizes(model: Any) -> int:
+    """Make constants, in place, of sizes looked up in shapes that are known; how many."""
+    import onnx
+    from onnx.numpy_helper import from_array, to_array
+
+    graph = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+    sizes = {
+        value.name: [each.dim_value for each in value.type.tensor_type.shape.dim]
+        for value in (*graph.input, *graph.value_info)
+        if value.type.tensor_type.HasField("shape")
+    }
+    constants = {tensor.name: tensor for tensor in model.graph.initializer}
+    shapes = {n.output[0]: sizes.get(n.input[0]) for n in model.graph.node if n.op_type == "Shape"}
+    found = []
+    for node in model.graph.node:
+        if node.op_type == "Gather" and shapes.get(node.input[0]) and node.input[1] in constants:
+            sought = np.asarray(shapes[node.input[0]])[to_array(constants[node.input[1]])]
+            if (sought > 0).all():  # 0 where it is free
+                model.graph.initializer.append(from_array(sought, node.output[0]))
+                found.append(node)
+    for node in found:
+        model.graph.node.remove(node)
+    return len(found)
 
 
 def _convolves(node: Any, rounded: str) -> bool:

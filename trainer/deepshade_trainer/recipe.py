@@ -73,6 +73,11 @@ class Recipe:
                 "val_fraction", detail=f"val_fraction must be in [0, 1), not {self.val_fraction}"
             )
 
+    @property
+    def schedule_is_cut(self) -> bool:
+        """Whether the run ends before its rate has warmed up."""
+        return self.warmup > self.steps
+
     def changed(self, **changes: Any) -> Recipe:
         """A copy with some settings replaced; `network` takes a dict of its own.
 

@@ -57,7 +57,7 @@ def train(
     nothing: they are reported with the names of their samples and skipped.
 
     Raises:
-        ConfigError: the run was begun with another recipe.
+        ConfigError: the run was begun with another recipe, or there is no such device.
         DataError: there is too little data, or almost all of it is non-finite.
     """
     trainer = _Trainer(recipe, folders, run, device)
@@ -67,7 +67,7 @@ def train(
 
 class _Trainer:
     def __init__(self, recipe: Recipe, folders: Sequence[Path], run: Run, device: str) -> None:
-        self.recipe, self.run, self.device = recipe, run, torch.device(device)
+        self.recipe, self.run, self.device = recipe, run, _device(device)
         torch.manual_seed(recipe.seed)
         self.network = build(recipe.network).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -88,6 +88,16 @@ class _Trainer:
                 fix="render more views, or train with a smaller --set batch=",
             )
         self.warnings: list[str] = []
+        if recipe.schedule_is_cut:
+            self.warnings.append(
+                f"the warm-up of {recipe.warmup} steps is longer than the run of {recipe.steps}: "
+                f"the rate never reaches {recipe.lr:g}; --set warmup={recipe.steps // 10} would do"
+            )
+        if held and self.data.one_scene:
+            self.warnings.append(
+                f"one scene: {len(held)} of its {len(self.data.entries)} views are held out, so "
+                "figures are of new views of this scene, not of new scenes"
+            )
         self.held = self._judged(held)
         self.average = {k: v.detach().clone() for k, v in self.network.state_dict().items()}
         self.optimizer = _optimizer(recipe, self.network)
@@ -162,6 +172,8 @@ class _Trainer:
         if self.first >= recipe.steps:
             return
         with SummaryWriter(str(self.run.log), purge_step=self.first) as log:
+            if recipe.init_from and not self.first:  # what it has to beat
+                yield Progress(0, recipe.steps, math.nan, self._validate(log, 0), self._warned())
             source = batches(
                 self.data,
                 self.training,
@@ -191,11 +203,15 @@ class _Trainer:
                     figures = self._validate(log, step)
                 if step % SAVE_EVERY == 0 or last:
                     self._save(step)
-                warning = "; ".join(self.warnings)
-                self.warnings.clear()
-                yield Progress(step, recipe.steps, smooth, figures, warning)
+                yield Progress(step, recipe.steps, smooth, figures, self._warned())
                 if last:
                     break
+
+    def _warned(self) -> str:
+        """The warnings since the last time."""
+        warning = "; ".join(self.warnings)
+        self.warnings.clear()
+        return warning
 
     def _learn(self, batch: Batch) -> tuple[float, str]:
         """One step on a batch: its loss, and what was wrong if it taught nothing."""
@@ -283,6 +299,26 @@ class _Trainer:
     def _save(self, step: int) -> None:
         groups = {"model": self.network.state_dict(), "average": self.average}
         self.run.save(groups, step, self.optimizer.state_dict())
+
+
+def _device(name: str) -> torch.device:
+    """The device of that name. Raises ConfigError where this machine or PyTorch lacks it."""
+    kind, _, number = name.partition(":")
+    if kind not in ("cpu", "cuda") or (number and not number.isdecimal()):
+        raise ConfigError(name, detail=f"no device is called {name!r}: cpu, cuda or cuda:1")
+    if kind == "cuda" and int(number or 0) >= torch.cuda.device_count():
+        built = torch.version.cuda
+        raise ConfigError(
+            "device",
+            detail=f"PyTorch finds no device '{name}': "
+            + (
+                "look whether 'nvidia-smi' lists it"
+                if built
+                else "this build is for the CPU alone; install PyTorch's CUDA build"
+            )
+            + ", or leave --device out to train on the CPU",
+        )
+    return torch.device(name)
 
 
 def _optimizer(recipe: Recipe, network: Network) -> torch.optim.Optimizer:

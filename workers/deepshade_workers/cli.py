@@ -13,6 +13,7 @@ import typer
 
 if TYPE_CHECKING:
     from deepshade_workers.environments import EnvironmentLight
+    from deepshade_workers.scenes.scene import Scene
     from deepshade_workers.view import Light
 
 Vector = tuple[float, float, float]
@@ -29,8 +30,13 @@ def render(
         ),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="EXR file to write.")],
-    eye: Annotated[Vector, typer.Option(help="The camera's place, scene units.")],
-    target: Annotated[Vector, typer.Option(help="What it looks at.")],
+    eye: Annotated[
+        Vector | None,
+        typer.Option(help="The camera's place, scene units.  [default: where most is seen from]"),
+    ] = None,
+    target: Annotated[
+        Vector | None, typer.Option(help="What it looks at.  [default: the scene's middle]")
+    ] = None,
     up: Annotated[Vector, typer.Option(help="Upward direction.")] = (0.0, 1.0, 0.0),
     fov: Annotated[float, typer.Option(help="Full horizontal angle, degrees.")] = 50.0,
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "768x512",
@@ -80,7 +86,9 @@ def render(
 ) -> None:
     """Render a view: every canonical attribute, the camera, and the references of EFFECTS.
 
-    Example:
+    Without --eye the camera is where most of the scene is seen from; it is printed. Examples:
+
+      deepshade render teapot.obj -o out.exr
 
       deepshade render teapot.obj -o out.exr --eye 0 3 6 --target 0 1 0 --radius 0.5
 
@@ -98,6 +106,7 @@ def render(
     from deepshade_workers.references import layer_of, require
     from deepshade_workers.render import render as render_view
     from deepshade_workers.scenes.loading import open_scene
+    from deepshade_workers.scenes.summary import warn
     from deepshade_workers.view import View
 
     if radius is not None and not (math.isfinite(radius) and radius > 0):
@@ -112,8 +121,10 @@ def render(
         if name not in ATTRIBUTES:
             raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called {name!r}")
     width, height = _size(size)
-    camera = Camera.look_at(eye, target, up, fov, width, height)
     opened = open_scene(scene)
+    warn(opened.notes)
+    eye, target = _placed(opened, eye, target, fov, width, height)
+    camera = Camera.look_at(eye, target, up, fov, width, height)
     view = View(
         camera,
         radius=opened.diagonal / 20 if radius is None else radius,
@@ -138,6 +149,30 @@ def render(
             f"  {name}: mean {found['mean']}, contrast {found['contrast']}, "
             f"standard error {found['error']}"
         )
+
+
+def _placed(
+    scene: Scene, eye: Vector | None, target: Vector | None, fov: float, width: int, height: int
+) -> tuple[Vector, Vector]:
+    """Eye and target as given, or of a view that is chosen, and said on standard error."""
+    from deepshade.errors import ConfigError
+    from deepshade_workers.framing import frame
+
+    if eye is not None:
+        if target is None:
+            x, y, z = (float(value) for value in scene.bounds.mean(0))
+            target = (x, y, z)
+        return eye, target
+    if target is not None:
+        raise ConfigError("eye", detail="--target needs --eye; without both a view is chosen")
+    found = frame(scene, fov, width, height)
+    places = (" ".join(f"{value:g}" for value in end) for end in (found.eye, found.target))
+    typer.echo(
+        f"seen from {found.place}: --eye {' --target '.join(places)}  "
+        f"(surfaces in {found.seen:.0%} of the scene's cells are in view)",
+        err=True,
+    )
+    return found.eye, found.target
 
 
 def _motion(text: str) -> tuple[str, Vector]:
@@ -225,8 +260,12 @@ def datagen(
         float | None, typer.Option(help="Effect radius, scene units.  [default: drawn per view]")
     ] = None,
     min_contrast: Annotated[
-        float, typer.Option(help="Least standard deviation of a view's occlusion.")
-    ] = 0.06,
+        float | None,
+        typer.Option(
+            help="Least standard deviation of a view's occlusion.  [default: what is measured on: "
+            "0.12 with ao, else 0.06]"
+        ),
+    ] = None,
     max_blur: Annotated[float, typer.Option(help="Largest blur circles drawn, pixels.")] = 48.0,
     max_motion: Annotated[float, typer.Option(help="Largest motions drawn, pixels.")] = 64.0,
     max_scatter: Annotated[
@@ -245,7 +284,10 @@ def datagen(
     layers: Annotated[
         str, typer.Option(help="More to render, commas between: do_visibility, do_directions.")
     ] = "",
-    shard_size: Annotated[int, typer.Option(help="Samples in a shard.", min=1)] = 128,
+    shard_size: Annotated[
+        int | None,
+        typer.Option(help="Samples in a shard.  [default: views / 16, 128 at most]", min=1),
+    ] = None,
     address: Annotated[
         str | None, typer.Option(help="A running Ray cluster.  [default: one of its own]")
     ] = None,
@@ -266,7 +308,9 @@ def datagen(
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
-    from deepshade_workers.datagen import DataSpec, expand_scenes, generate
+    from deepshade_workers.datagen import DataSpec, default_shard_size, expand_scenes, generate
+    from deepshade_workers.scenes.loading import notes_of
+    from deepshade_workers.scenes.summary import warn
 
     spec = DataSpec(
         scenes=expand_scenes(scenes),
@@ -278,7 +322,7 @@ def datagen(
         seed=seed,
         radius=radius,
         min_contrast=min_contrast,
-        shard_size=shard_size,
+        shard_size=shard_size or default_shard_size(views, out),
         max_blur=max_blur,
         max_motion=max_motion,
         max_scatter=max_scatter,
@@ -287,6 +331,7 @@ def datagen(
         skies=skies,
         layers=tuple(_listed(layers)),
     )
+    warn(notes_of(spec.scenes))
     begun = time.monotonic()
     done, fresh = _watched(generate(spec, out, address=address), hidden=as_json)
     seconds = time.monotonic() - begun
@@ -301,28 +346,16 @@ def datagen(
 
 
 def _watched(steps: Iterator[tuple[int, int]], *, hidden: bool) -> tuple[int, int]:
-    """Samples (done, newly rendered) after all `steps` of (done, in all).
+    """Samples (done, newly rendered) after all `steps` of (done, in all)."""
+    from deepshade.console import Watch
 
-    They show as a bar on a terminal, as a line every 15 s elsewhere.
-    """
-    from rich import progress
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    plain = not console.is_terminal
-    columns = ("rendering", progress.BarColumn(), progress.MofNCompleteColumn())
-    times = ("{task.fields[rate]}", progress.TimeElapsedColumn(), progress.TimeRemainingColumn())
-    begun = said = time.monotonic()
-    first, done = None, 0
-    with progress.Progress(*columns, *times, console=console, disable=plain or hidden) as bar:
-        task = bar.add_task("", total=None, rate="")
-        for done, total in steps:
-            first = done if first is None else first
-            now = time.monotonic()
-            rate = (done - first) / max(now - begun, 1e-9)
-            bar.update(task, completed=done, total=total, rate=f"{rate:.2f}/s")
-            if plain and not hidden and now - said > 15:
-                said = now
-                left = f"{(total - done) / rate / 60:.1f} min left" if rate else ""
-                console.print(f"rendering {done}/{total}  {rate:.2f}/s  {left}")
+    first, done, total = None, 0, 0
+    with Watch("rendering", "views", hidden=hidden) as watch:
+        try:
+            for done, total in steps:
+                first = done if first is None else first
+                watch.update(done, total)
+        except KeyboardInterrupt:
+            watch.say(f"stopped at {done} of {total} views; the same command goes on")
+            raise
     return done, done - (first or 0)

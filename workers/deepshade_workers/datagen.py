@@ -31,10 +31,12 @@ from deepshade_workers.scenes.loading import (
 )
 from deepshade_workers.scenes.procedural import FAMILIES
 from deepshade_workers.shards import schema, shard_name, write_shard
-from deepshade_workers.view import Images, Limits, Vector, View
+from deepshade_workers.view import MIN_CONTRAST, Images, Limits, Vector, View
 
 # How often a sample whose scene shows nothing useful may ask for another scene.
 SCENE_TRIES = 16
+STARTS = 3  # of Ray, which gives a busy machine no more than 30 s for one
+MAX_SHARD = 128  # samples
 # Attributes that the camera and the scene's shape alone decide.
 GEOMETRY = {"position", "normal", "normal_world", "depth", "view", "view_angle"}
 
@@ -44,7 +46,8 @@ class DataSpec:
     """What a data set holds; two equal ones make equal bytes.
 
     `scenes` are files, `procedural:<family>` or `compose:<parts>`; `size` is a sample's side and
-    `frame` that of the view it is cut from, in pixels; `radius` None draws one for each view.
+    `frame` that of the view it is cut from, in pixels; `radius` None draws one for each view;
+    `min_contrast` None is what the effects' rows ask of occlusion, so that each view counts.
     Effects that see more than places and normals have light, lens, motions and materials drawn for
     each view, up to `max_blur`, `max_motion` and `max_scatter` pixels (`view.Limits`), with
     pictures from the folder `textures` among their textures. Effects under an environment get, for
@@ -60,7 +63,7 @@ class DataSpec:
     spp: int = 256
     seed: int = 0
     radius: float | None = None
-    min_contrast: float = 0.06
+    min_contrast: float | None = None
     shard_size: int = 128
     max_blur: float = Limits.max_blur
     max_motion: float = Limits.max_motion
@@ -105,6 +108,15 @@ class DataSpec:
         return range(shard * self.shard_size, min(self.views, (shard + 1) * self.shard_size))
 
     @property
+    def least_contrast(self) -> float:
+        """Least standard deviation of a view's ambient occlusion."""
+        if self.min_contrast is not None:
+            return self.min_contrast
+        rows = [EFFECTS[name] for name in self.effects]
+        asked = (row.min_contrast for row in rows if row.contrast == "deviation")
+        return max([MIN_CONTRAST, *asked])
+
+    @property
     def limits(self) -> Limits | None:
         """What views draw beside the camera; None where no effect would see it."""
         seen = {name for effect in self.effects for name in EFFECTS[effect].inputs}
@@ -120,6 +132,7 @@ class DataSpec:
     def settings(self) -> dict[str, Any]:
         """JSON-ready settings, for the manifest; those that nothing depends on are left out."""
         found = {**asdict(self), "scenes": list(self.scenes), "effects": list(self.effects)}
+        found["min_contrast"] = self.least_contrast
         if self.limits is None:
             for key in asdict(Limits()):
                 del found[key]
@@ -130,6 +143,16 @@ class DataSpec:
         else:
             del found["layers"]
         return found
+
+
+def default_shard_size(views: int, folder: Path) -> int:
+    """A sixteenth of the views, so that cores share them and a kill loses little; 128 at most.
+
+    A data set that is there keeps its own.
+    """
+    if (folder / NAME).exists():
+        return int(Manifest.read(folder).settings.get("shard_size", MAX_SHARD))
+    return max(1, min(MAX_SHARD, views // 16))
 
 
 def expand_scenes(names: list[str]) -> tuple[str, ...]:
@@ -199,7 +222,7 @@ def _rendered(
                 frame=spec.frame,
                 size=spec.size,
                 radius=spec.radius,
-                min_contrast=spec.min_contrast,
+                min_contrast=spec.least_contrast,
                 displacements=displacements,
                 limits=spec.limits,
             )
@@ -381,9 +404,22 @@ def _connect(address: str | None) -> None:
     try:
         if host and port.isdigit():  # where nothing listens Ray itself would try for minutes
             socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
-        ray.init(address=where, **options)
-    except OSError as error:
+        for tries in range(STARTS, 0, -1):
+            try:
+                ray.init(address=where, **options)
+                return
+            except Exception as error:  # Ray has no type of its own for it
+                ray.shutdown()
+                if "timed out during startup" not in str(error):
+                    raise
+                if tries == 1:
+                    raise DataError(
+                        f"Ray did not start within its 30 s, {STARTS} times",
+                        fix="the machine is busy: run the same command again",
+                    ) from error
+    except (OSError, ray.exceptions.AuthenticationError) as error:
         raise DataError(
-            f"there is no Ray cluster at {where}: {error}",
-            fix="start one with 'ray start --head', or leave --address out",
+            f"there is no Ray cluster for us at {where}: {error}",
+            fix="start one with 'ray start --head', or leave --address out; where it has a token, "
+            "set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN to what 'ray get-auth-token' prints there",
         ) from error

@@ -18,6 +18,8 @@ mi = mitsuba()
 # Offset of ray origins against self-intersection, relative to the larger of the scene's size and
 # the point's coordinates: float32 resolves 2^-23 of them and intersection loses a few bits more.
 ORIGIN_OFFSET = 2.0**-19
+# The terms that textures of files say.
+PAINTED = ("diffuse", "specular", "gloss")
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,8 @@ def material(scene: Scene, view: View, surface: Any, valid: Any, name: str, chan
     """A Phong term or the "object" number at interactions with a view's scene: 1 or 3 channels.
 
     `surface` is Mitsuba's interaction, `valid` where there is one. Our meshes carry the values per
-    face, unless the view has a look. A Mitsuba XML scene's shapes tell only their diffuse
-    reflectance; all else is 0.
+    face or in textures, unless the view has a look. A Mitsuba XML scene's shapes tell only their
+    diffuse reflectance; all else is 0.
     """
     shape = surface.shape
     if view.look is not None and view.look.holds(name):
@@ -109,8 +111,13 @@ def material(scene: Scene, view: View, surface: Any, valid: Any, name: str, chan
     key = f"face_{name}"
     known = shape.has_attribute(key, valid)
     if channels == 1:
-        return dr.select(known, shape.eval_attribute_1(key, surface, known), 0)
-    other = mi.Color3f(0)
-    if name == "diffuse":
-        other = surface.bsdf().eval_diffuse_reflectance(surface, valid)
-    return dr.select(known, shape.eval_attribute_3(key, surface, known), other)
+        value = dr.select(known, shape.eval_attribute_1(key, surface, known), 0)
+    else:
+        other = mi.Color3f(0)
+        if name == "diffuse":
+            other = surface.bsdf().eval_diffuse_reflectance(surface, valid)
+        value = dr.select(known, shape.eval_attribute_3(key, surface, known), other)
+    if scene.painting is not None and name in PAINTED:
+        painted, term = scene.painting.term(surface, view.camera, valid, name)
+        value = dr.select(painted, term, value)
+    return value

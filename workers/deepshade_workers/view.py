@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from deepshade_workers.environments import EnvironmentLight
     from deepshade_workers.look import Look
 
+# A view's ambient occlusion varies by at least as much (standard deviation), or it shows nothing.
+MIN_CONTRAST = 0.06
+
 Vector = tuple[float, float, float]
 Image = NDArray[np.float32]  # planar: (C, H, W)
 Images = dict[str, Image]

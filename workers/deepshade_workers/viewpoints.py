@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from deepshade.camera import Camera
+from deepshade.effects import SETTINGS
 from deepshade.errors import SceneError
 from deepshade_workers.drawing import dress
 from deepshade_workers.references import ao
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import Hits, trace
-from deepshade_workers.view import Limits, Vector, View
+from deepshade_workers.view import MIN_CONTRAST, Limits, Vector, View
 
 FOV = 50.0
 PROBE = 48
@@ -21,7 +22,7 @@ MAX_TRIES = 400
 MAX_BACKGROUND = 0.6
 MAX_BACK_FACES = 0.05
 # Effect radius relative to the view's median depth: about 25 to 280 pixels of a 512-pixel frame.
-RADIUS_RANGE = (0.05, 0.5)
+RADIUS_RANGE = SETTINGS["radius"].learnt
 
 
 def sample_view(
@@ -31,7 +32,7 @@ def sample_view(
     frame: int,
     size: int,
     radius: float | None = None,
-    min_contrast: float = 0.06,
+    min_contrast: float = MIN_CONTRAST,
     displacements: Mapping[str, Vector] | None = None,
     limits: Limits | None = None,
 ) -> View:

@@ -12,6 +12,7 @@ from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine, Float
 from deepshade.environments import black
 from deepshade.errors import EngineError
+from deepshade.extras import install_command
 
 _PROVIDERS = {"onnxruntime": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 
@@ -94,7 +95,7 @@ def _runtime() -> Any:
         import onnxruntime
     except ImportError as error:
         raise EngineError(
-            "ONNX Runtime is not installed", fix="pip install 'deepshade[service]'"
+            "ONNX Runtime is not installed", fix=install_command("service")
         ) from error
     return onnxruntime
 

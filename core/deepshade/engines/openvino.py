@@ -31,6 +31,7 @@ from deepshade.engines.base import Backend, Engine, Float
 from deepshade.engines.quantising import quantise
 from deepshade.engines.splitting import Piece, split
 from deepshade.errors import EngineError
+from deepshade.extras import install_command
 from deepshade.machine import cpu_kind
 
 _CAPABILITIES = {"bf16": "BF16", "int8": "INT8", "fp32": "FP32"}
@@ -202,9 +203,7 @@ def _core() -> Any:
     try:
         from openvino import Core
     except ImportError as error:
-        raise EngineError(
-            "OpenVINO is not installed", fix="pip install 'deepshade[service]' or openvino"
-        ) from error
+        raise EngineError("OpenVINO is not installed", fix=install_command("service")) from error
     return Core()
 
 

@@ -9,6 +9,7 @@ from typing import Any
 from deepshade.bundles import Bundle
 from deepshade.engines.base import Backend, Engine
 from deepshade.errors import EngineError, nearest
+from deepshade.extras import install_command
 from deepshade.machine import cpu_kind
 
 # What every machine with the service has, and what the others are measured against.
@@ -63,7 +64,7 @@ def choose(bundle: Bundle, engine: str | None = None, precision: str | None = No
     here = ", ".join(map(str, usable(bundle)))
     raise EngineError(
         f"no '{asked[:100]}' for this bundle on this machine" if here else "no engine is installed",
-        fix=f"one of: {here}" if here else "pip install 'deepshade[service]'",
+        fix=f"one of: {here}" if here else install_command("service"),
     )
 
 

@@ -27,6 +27,7 @@ MAX_STRIP = 8 * 2**20
 MIN_STRIP = 2**20
 
 _TYPES = {"half": "<f2", "float": "<f4", "uint": "<u4"}
+_AGAIN = "save or send the file again"
 
 
 @dataclass(slots=True)
@@ -112,7 +113,10 @@ def _decode(data: bytes, wanted: Wanted, rows: Sequence[int], repeats: Repeats) 
         if row in repeats
         for run in _runs(repeats[row])
     ]
-    stored = _uncompressed(data, wanted, rows) or _by_library(chunks.cut(memoryview(data), rows))
+    where = f"scanlines {runs[0].start} to {runs[-1].stop - 1}"
+    stored = _uncompressed(data, wanted, rows) or _by_library(
+        chunks.cut(memoryview(data), rows), where
+    )
     for name, plane in wanted.planes.items():
         pixels = stored.get(name)
         if pixels is None or pixels.shape != (height, plane.shape[1]):
@@ -128,20 +132,25 @@ def _decode(data: bytes, wanted: Wanted, rows: Sequence[int], repeats: Repeats) 
             np.copyto(plane[target].reshape(-1, *each.shape), each)
 
 
-def _by_library(data: bytes) -> dict[str, NDArray[Any]]:
-    """All the channels of a single-part file, by the OpenEXR library."""
+def _by_library(data: bytes, where: str) -> dict[str, NDArray[Any]]:
+    """All the channels of a single-part file, by the OpenEXR library; `where` is for errors."""
     try:
         # no threads of the library's own: those here decode other strips
         with OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0) as file:
-            found = file.parts[0].channels
-            return {name: channel.pixels for name, channel in found.items()}
+            if file.parts:
+                found = file.parts[0].channels
+                return {name: channel.pixels for name, channel in found.items()}
     except MemoryError:
         raise
     except Exception as error:
         text = str(error).replace('"<python_buffer>"', "").strip() or type(error).__name__
         raise DamagedImageError(
-            f"the image is damaged: {text.splitlines()[0][:200]}", fix="save or send the file again"
+            f"the image is damaged within {where}: {text.splitlines()[0][:200]}", fix=_AGAIN
         ) from error
+    # the library prints what is wrong, and gives a file without parts
+    raise DamagedImageError(
+        f"the image is damaged within {where}: pixels can't be decompressed", fix=_AGAIN
+    )
 
 
 def _uncompressed(data: bytes, wanted: Wanted, rows: Sequence[int]) -> dict[str, NDArray[Any]]:

@@ -16,7 +16,9 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 
 from deepshade import floats
+from deepshade.exr.attributes import Cursor
 from deepshade.exr.chunks import LONG_NAMES, MAGIC, Window
+from deepshade.exr.entries import Entry
 from deepshade.threads import run_all, thread_count
 
 # name -> (code, scanlines in one chunk)
@@ -53,7 +55,7 @@ def encode(
 
     `channels` are (H, W) arrays of numbers, of the size of `data_window`; those in `half` are
     stored in 16 bits, the others in 32. `compression` is one of `COMPRESSIONS`. `attributes` are
-    int, float, str, and arrays that are int32 (2,) or (3,), or float32 (2,), (3,), (3, 3) or
+    int, float, str, Entry, and arrays that are int32 (2,) or (3,), or float32 (2,), (3,), (3, 3) or
     (4, 4). Raises ValueError for names or attributes that no such file can hold.
     """
     code, lines = COMPRESSIONS[compression]
@@ -95,6 +97,22 @@ def encode(
     begin = len(header) + 8 * len(chunks)
     table = np.cumsum([begin, *(len(chunk) for chunk in chunks[:-1])], dtype="<u8")
     return [header, table.tobytes(), *chunks]
+
+
+def with_entries(body: memoryview, entries: Mapping[str, Entry]) -> list[memoryview | bytes]:
+    """A single-part file with more header attributes, as consecutive pieces of its bytes.
+
+    The library writes no rational numbers, and so not every entry.
+    """
+    cursor = Cursor(body, 8)  # after magic number and version
+    while cursor.name():
+        cursor.name()  # its type
+        cursor.skip(*cursor.unpack("<i"))
+    more = b"".join(_attribute(name, each.kind, each.data) for name, each in entries.items())
+    table_at = cursor.at
+    (first,) = cursor.unpack("<Q")  # of the chunks, which follow their table
+    table = np.frombuffer(body[table_at:first], "<u8") + np.uint64(len(more))
+    return [body[: table_at - 1], more, bytes(1), table.tobytes(), body[first:]]
 
 
 def _strip(planes: list[tuple[bool, NDArray[Any]]], lines: int) -> list[bytes]:
@@ -146,12 +164,14 @@ def _header(
     for name in ("channels", "lineOrder", "chunkCount"):
         if name in attributes:
             raise ValueError(f"the header attribute '{name}' can't be chosen")
-    pieces = []
-    for name, (kind, value) in sorted({**values, **structure}.items()):
-        pieces += [_name(name), _name(kind), struct.pack("<i", len(value)), value]
+    pieces = [_attribute(name, *each) for name, each in sorted({**values, **structure}.items())]
     long = any(len(name.encode()) > _SHORT_NAME for name in (*values, *channels))
     start = struct.pack("<2I", MAGIC, 2 | (LONG_NAMES if long else 0))
     return b"".join((start, *pieces, b"\0"))
+
+
+def _attribute(name: str, kind: str, value: bytes) -> bytes:
+    return _name(name) + _name(kind) + struct.pack("<i", len(value)) + value
 
 
 def _name(name: str) -> bytes:
@@ -163,6 +183,8 @@ def _name(name: str) -> bytes:
 
 def _value(value: Any) -> tuple[str, bytes]:
     """An attribute's type and bytes."""
+    if isinstance(value, Entry):
+        return value.kind, value.data
     if isinstance(value, int):
         return "int", struct.pack("<i", value)
     if isinstance(value, str):

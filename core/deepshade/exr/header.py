@@ -22,6 +22,7 @@ from deepshade.errors import DamagedImageError, ImageError
 from deepshade.exr import chunks as exrchunks
 from deepshade.exr.attributes import MAX_ATTRIBUTES, Buffer, Cursor, RawPart, read_part
 from deepshade.exr.chunks import DEEP, LONG_NAMES, MAGIC, MULTIPART, TILED, Chunks, Window
+from deepshade.exr.entries import Entry, kept
 from deepshade.exr.limits import Limits
 
 LIBRARY_VERSION = tuple(int(number) for number in re.findall(r"\d+", OpenEXR.OPENEXR_VERSION)[:3])
@@ -44,7 +45,7 @@ class Part:
 
     Windows are (x0, y0, x1, y1), inclusive. `channels` maps names, in the file's order, to
     "half", "float" or "uint"; those in `subsampled` hold fewer values than there are pixels.
-    `chunks` says where the pixels lie in the file's bytes.
+    `chunks` says where the pixels lie in the file's bytes, `entries` what an answer keeps.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Part:
     chunks: Chunks = field(repr=False, compare=False)
     tiled: bool = False
     subsampled: frozenset[str] = frozenset()
+    entries: dict[str, Entry] = field(default_factory=dict, repr=False)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -213,6 +215,7 @@ def _check_part(raw: RawPart, cursor: Cursor, flags: int, index: int, limits: Li
         ),
         tiled=tiled,
         subsampled=frozenset(raw.subsampled),
+        entries=kept(raw.types, raw.values),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -18,6 +19,7 @@ from deepshade.errors import ImageError
 from deepshade.exr import encode as exrencode
 from deepshade.exr.chunks import Window
 from deepshade.exr.decode import Wanted, decode
+from deepshade.exr.entries import Entry
 from deepshade.exr.header import MAX_COORDINATE, WRITABLE, Header, parse
 from deepshade.exr.limits import Limits
 from deepshade.files import replacing
@@ -121,8 +123,9 @@ def write(
     stored in 16 bits: all, none, or those named; finite values beyond ±65504 are clamped there
     rather than turned into infinities. Windows are (x0, y0, x1, y1), inclusive: where the pixels
     lie, and the whole frame; each begins at (0, 0) and has the image's size by default.
-    `attributes` are numbers, strings, 2- or 3-vectors, 3x3 or 4x4 matrices; an integer beyond
-    32 bits is stored as text. A path is replaced atomically: written beside, synced, renamed.
+    `attributes` are numbers, strings, 2- or 3-vectors, 3x3 or 4x4 matrices, and entries of another
+    file; an integer beyond 32 bits is stored as text. A path is replaced atomically: written
+    beside, synced, renamed.
     Raises ValueError for arrays or settings that no EXR can hold.
     """
     if compression not in COMPRESSIONS:
@@ -151,14 +154,21 @@ def write(
             name: floats.to_half(plane) if name in halves else np.ascontiguousarray(plane, "f4")
             for name, plane in planes.items()
         }
-        settings = header | {
+        entries = {name: value for name, value in header.items() if isinstance(value, Entry)}
+        settings = {name: value for name, value in header.items() if name not in entries} | {
             "compression": COMPRESSIONS[compression],
             "type": OpenEXR.scanlineimage,
             "dataWindow": _corners(data),
             "displayWindow": _corners(display),
         }
         with OpenEXR.File(settings, stored, num_threads=_library_threads()) as file:
-            file.write(stream)
+            if not entries:
+                file.write(stream)
+                return
+            body = io.BytesIO()
+            file.write(body)
+        for part in exrencode.with_entries(body.getbuffer(), entries):
+            stream.write(part)
 
     if isinstance(target, (str, os.PathLike)):
         with replacing(Path(target)) as temporary, temporary.open("wb") as stream:
@@ -197,7 +207,7 @@ def _attribute(key: str, value: Any) -> Any:
         return int(value) if -(2**31) <= value < 2**31 else str(value)
     if isinstance(value, (float, np.floating)):
         return float(value)
-    if isinstance(value, str):
+    if isinstance(value, str | Entry):
         return value
     if isinstance(value, (np.ndarray, Sequence)) and not isinstance(value, bytes):
         array = np.asarray(value)

@@ -252,7 +252,7 @@ class _Examination:
             f"{seen}: {side:.0%} lie behind it" if side > _FEW else seen,
             seen=seen,
             fix="if they are in world space, say so and where the camera is: "
-            "--map position_world=<layer> and --world_to_camera <16 numbers>",
+            "--map position_world=<layer> and --world-to-camera <16 numbers>",
         )
 
     def _field_of_view(self, pixel: float) -> None:
@@ -412,4 +412,4 @@ def _shown(name: str, stored: Array) -> Mask:
 
 
 def _lengths(vectors: Array) -> Array:
-    return np.sqrt((vectors.astype(np.float64) ** 2).sum(0))
+    return np.asarray(np.sqrt((vectors.astype(np.float64) ** 2).sum(0)))

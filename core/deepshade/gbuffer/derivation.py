@@ -23,13 +23,13 @@ Requirement = Literal["fov", "matrix", "lens"]
 _PIECE = 2**13  # pixels transformed at a time
 
 _REQUIREMENTS: dict[Requirement, str] = {
-    "fov": "the field of view",
+    "fov": "the field of view (--fov)",
     "matrix": "the camera's matrix (worldToCamera)",
     "lens": "the field of view and the lens (deepshade:focus and deepshade:aperture)",
 }
 REQUIREMENT_FIXES: dict[Requirement, str] = {
-    "fov": "give the full horizontal angle in degrees (--fov <degrees>), or write deepshade:fov",
-    "matrix": "write the standard header attribute worldToCamera (M44f)",
+    "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov",
+    "matrix": "give it (--world-to-camera), or write the standard header attribute worldToCamera",
     "lens": "give the full horizontal angle, the focus distance and the aperture's diameter, or "
     "write deepshade:fov, deepshade:focus and deepshade:aperture",
 }
@@ -210,6 +210,16 @@ def unmet(target: str, have: Collection[str], met: Collection[str]) -> list[Requ
     if plan(target, have, _REQUIREMENTS) is None:
         return []
     return [r for r in missing if plan(target, have, _REQUIREMENTS.keys() - {r}) is None]
+
+
+def enough(missing: Collection[str]) -> str:
+    """In words, what common pass all of them could be derived from; "" if there is none."""
+    cameras: tuple[tuple[Requirement, ...], ...] = (("fov",), ("fov", "matrix"))
+    for given in (("depth",), ("depth", "normal")):
+        for met in cameras:
+            if all(plan(name, given, met) is not None for name in missing):
+                return f"{' and '.join(given)} with {requirement_text(met)} would do"
+    return ""
 
 
 def requirements(

@@ -16,6 +16,7 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera, placement_of
 from deepshade.errors import ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
+from deepshade.exr.entries import Entry
 from deepshade.gbuffer import background, channels, derivation
 from deepshade.gbuffer.checks import Verdict, examine
 from deepshade.gbuffer.conventions import Conventions, apply
@@ -40,8 +41,8 @@ class GBuffer:
     `decoded` all that were read for that, as (file, channel), and `derived` how the others were
     computed, or how what is there had to be read; `warnings` say what looks unlikely. The
     windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes came from,
-    `part_header` its own attributes; `header` holds those of all parts and files, the first of
-    each name. `up` is the world's up axis, as its renderer has it.
+    `part_header` its own attributes, `entries` those of the shot; `header` holds those of all
+    parts and files, the first of each name. `up` is the world's up axis, as its renderer has it.
     """
 
     attributes: dict[str, NDArray[np.float32]]
@@ -54,6 +55,7 @@ class GBuffer:
     warnings: tuple[str, ...] = ()
     header: dict[str, Any] = field(default_factory=dict)
     part_header: dict[str, Any] = field(default_factory=dict)
+    entries: dict[str, Entry] = field(default_factory=dict)
     data_window: exr.Window = (0, 0, 0, 0)
     display_window: exr.Window = (0, 0, 0, 0)
     up: Literal["y", "z"] = "y"
@@ -67,9 +69,14 @@ class GBuffer:
         """EXR attributes that, beside the windows, put an answer exactly where its input lies.
 
         Pixel aspect, screen window and worldToCamera: the camera's, or without one (no field of
-        view is known) what the part's header says of them, as far as it is usable.
+        view is known) what the part's header says of them, as far as it is usable. The matrix is
+        the header's own, where it has one, whichever way its camera looks.
         """
-        return placement_of(self.part_header) | (self.camera.to_header() if self.camera else {})
+        said = placement_of(self.part_header)
+        camera = self.camera.to_header() if self.camera else {}
+        if "worldToCamera" in said:
+            camera.pop("worldToCamera", None)
+        return said | camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,6 +215,7 @@ def _load(
             warnings=tuple(verdict.warnings),
             header=job.plan.attributes,
             part_header=job.part.attributes,
+            entries=job.part.entries,
             data_window=job.part.data_window,
             display_window=job.part.display_window,
             up=job.plan.profile.up if job.plan.profile else "y",

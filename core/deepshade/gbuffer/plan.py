@@ -21,6 +21,8 @@ from deepshade.gbuffer.suggestions import near_misses
 
 MARKERS = ("depth", "distance", "alpha")  # read, where there, to know the background
 
+ABSENT = "not there"  # why an attribute can't be had, when nothing would make it derivable
+
 
 @dataclass(slots=True)
 class Plan:
@@ -73,7 +75,7 @@ class Plan:
         if attribute in self.ambiguous:
             return str(self.ambiguous[attribute])
         needs = derivation.unmet(attribute, self.choices, self.met)
-        return f"needs {derivation.requirement_text(needs)}" if needs else "not there"
+        return f"needs {derivation.requirement_text(needs)}" if needs else ABSENT
 
     def how(self, step: derivation.Derivation) -> str:
         """How a derivation gets its attribute, and what it had to pass over."""
@@ -104,7 +106,7 @@ class Plan:
         if missing:
             found = [name for layer in self.layers for name in layer.channels]
             near = near_misses(self.layers, missing)
-            raise MissingAttributeError(missing, found, near)
+            raise MissingAttributeError(missing, found, near, enough=derivation.enough(missing))
         wanted = list(dict.fromkeys(need for name in lacking for need in unmet[name]))
         raise CameraError(
             f"{', '.join(map(repr, lacking))} could be derived from what is there, but that needs "

@@ -26,6 +26,7 @@ QUANTITIES: dict[str, int] = {
     "position_world": 3,  # world-space position
     "distance": 1,  # depth along the ray
     "alpha": 1,
+    "beauty": 3,  # the finished picture; nothing is derived from it
 }
 
 Header = Mapping[str, Any]
@@ -139,7 +140,12 @@ _CANONICAL = tuple(
 _TABLE: Sequence[Profile] = (
     Profile(
         "deepshade",
-        (*_CANONICAL, Source("position_world", ("position_world",)), Source("alpha", ("A",))),
+        (
+            *_CANONICAL,
+            Source("position_world", ("position_world",)),
+            Source("alpha", ("A",)),
+            Source("beauty", ("beauty", "Combined", "Image", "rgba", "rgb", "Ci")),
+        ),
         # its names are their own signature: header facts like deepshade:fov may be added to
         # any renderer's file
         lambda header: False,

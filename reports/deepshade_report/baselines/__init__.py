@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from types import ModuleType
 
 from deepshade.errors import DeepshadeError
-from deepshade.extras import extra_of
+from deepshade.extras import extra_of, install_command
 from deepshade_report.method import Method
 
 
@@ -38,7 +38,7 @@ def baselines(
             found += import_module(f"{__name__}.{effect}.{module}").methods(quick)
         except ModuleNotFoundError as error:
             extra = extra_of(error.name or "")
-            fix = f"; pip install 'deepshade[{extra}]'" if extra else ""
+            fix = f"; {install_command(extra)}" if extra else ""
             missing[name] = f"no module '{error.name}'{fix}"
         except DeepshadeError as error:
             missing[name] = f"{error} {error.fix}".strip()

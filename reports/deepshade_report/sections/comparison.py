@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from deepshade import pictures
 from deepshade.errors import DeepshadeError
+from deepshade.timing import significant
 from deepshade_report.context import Context
 from deepshade_report.plots import PALETTE, png, themed
 from deepshade_report.sections import Skipped, points, standing_for, title
 from deepshade_report.sections.methods import methods, shaded
-from deepshade_report.timing import significant
 from deepshade_report.view import Float, View
 
 PICTURE = "comparison.png"

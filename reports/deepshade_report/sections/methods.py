@@ -9,10 +9,10 @@ from statistics import fmean, stdev
 from typing import Any
 
 from deepshade.errors import DeepshadeError
+from deepshade.timing import alternate, significant, spread
 from deepshade_report.baselines import baselines
 from deepshade_report.context import Context
 from deepshade_report.method import Method, Network, identity, networks
-from deepshade_report.timing import alternate, significant, spread
 from deepshade_report.view import HEIGHT, MEGAPIXELS, WIDTH, View, fullest, resized
 
 _SPEED_SECONDS = 100.0

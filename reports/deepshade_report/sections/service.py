@@ -7,10 +7,10 @@ from functools import partial
 from typing import Any
 
 from deepshade.engines import Backend, load_engine
+from deepshade.timing import alternate, ratio, spread
 from deepshade_report.context import Context
 from deepshade_report.method import Network
 from deepshade_report.server import STAGES, Server
-from deepshade_report.timing import alternate, ratio, spread
 from deepshade_report.view import HEIGHT, WIDTH, body, fullest, resized
 
 _SECONDS = 45.0

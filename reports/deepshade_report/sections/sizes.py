@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from deepshade.machine import memory_bytes
+from deepshade.timing import alternate, significant, spread
 from deepshade_report.context import Context
 from deepshade_report.server import Server
-from deepshade_report.timing import alternate, significant, spread
 from deepshade_report.view import HEIGHT, WIDTH, body, fullest
 
 GIB = 2**30

@@ -4,18 +4,19 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from deepshade.errors import SceneError, nearest
 from deepshade_workers.scenes.composition import compose, files_of
-from deepshade_workers.scenes.mesh import Material, Mesh, merge
+from deepshade_workers.scenes.gltf import load_gltf
+from deepshade_workers.scenes.mesh import Mesh
+from deepshade_workers.scenes.plain import load_plain
 from deepshade_workers.scenes.procedural import FAMILIES, generate
 from deepshade_workers.scenes.scene import Scene
 
-MESH_SUFFIXES = {".obj", ".ply", ".gltf", ".glb", ".stl", ".off"}
+GLTF_SUFFIXES = {".gltf", ".glb"}
+MESH_SUFFIXES = GLTF_SUFFIXES | {".obj", ".ply", ".stl", ".off"}
 SUFFIXES = MESH_SUFFIXES | {".xml"}
 PROCEDURAL = "procedural"
 COMPOSED = "compose"
@@ -81,88 +82,48 @@ def load_mesh(path: Path) -> Mesh:
     """Read every mesh of a file, with its node transforms and materials, into one.
 
     Each node of the scene graph that holds triangles is an object.
-    Normals of the file are kept; where there are none, edges sharper than 40° stay sharp.
-    """
-    import trimesh
+    Normals of the file are kept; where there are none, edges sharper than 40° stay sharp. The
+    mesh's `notes` name what was missing.
 
+    Raises:
+        SceneError: there is no such file, it can't be read, or it holds no triangles.
+    """
     if not path.is_file():
         raise SceneError(f"there is no scene file {path}")
-    if path.suffix.lower() not in MESH_SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
         raise SceneError(
             f"{path}: unknown scene format {path.suffix!r}",
             fix=f"known formats: {', '.join(sorted(SUFFIXES))}",
         )
+    read = load_gltf if suffix in GLTF_SUFFIXES else load_plain
     try:
-        loaded = trimesh.load_scene(path, process=False)
-        nodes = loaded.graph.nodes_geometry
-        meshes = {node: mesh for node in nodes if (mesh := _placed(loaded, node)) is not None}
+        mesh = read(path)
+    except SceneError:
+        raise
     except Exception as error:  # trimesh raises whatever its many parsers do
-        raise SceneError(f"{path} can't be read: {error}") from error
-    if not any(len(mesh.faces) for mesh in meshes.values()):
+        what = f"no {error}" if isinstance(error, KeyError) else error
+        raise SceneError(f"{path} can't be read: {what}") from error
+    if not len(mesh.faces):
         raise SceneError(f"{path} holds no triangles")
-    return merge(meshes.values(), list(meshes))
+    return mesh
+
+
+def notes_of(names: Iterable[str]) -> tuple[str, ...]:
+    """What is missing of the mesh files among scenes' `names`: some textures, say.
+
+    Raises:
+        SceneError: a file can't be read.
+    """
+    paths: dict[Path, None] = {}
+    for name in names:
+        kind = name.split(":")[0]
+        if kind == COMPOSED:
+            found = files_of(parse_composed(name)[0], frozenset(MESH_SUFFIXES))
+        else:
+            found = (Path(name),)
+        paths |= {path: None for path in found if path.suffix.lower() in MESH_SUFFIXES}
+    return tuple(note for path in paths if path.is_file() for note in load_mesh(path).notes)
 
 
 _kept = functools.lru_cache(maxsize=256)(load_mesh)
-
-
-def _placed(scene: Any, node: str) -> Mesh | None:
-    """The mesh of a scene graph's node where its transforms put it; None if it has none.
-
-    trimesh can do this itself (`dump`), but then forgets the normals that the file brought.
-    """
-    import trimesh
-
-    matrix, name = scene.graph[node]
-    part = scene.geometry[name]
-    if not isinstance(part, trimesh.Trimesh) or not len(part.faces):
-        return None
-    if np.linalg.det(matrix[:3, :3]) == 0:
-        return None  # squashed flat: some exporters hide things so
-    return _convert(part).transformed(np.asarray(matrix, np.float64))
-
-
-def _convert(part: Any) -> Mesh:
-    material = _material(part.visual)
-    vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
-    if "vertex_normals" in part._cache and len(part.vertex_normals) == len(vertices):
-        normals = np.asarray(part.vertex_normals)
-        return Mesh.build(vertices, faces, vertex_normals=normals, material=material)
-    # vertices at the same place become one, so that normals smooth across texture seams
-    unique, index = np.unique(vertices, axis=0, return_inverse=True)
-    return Mesh.build(unique, index.reshape(-1)[faces], crease=40, material=material)
-
-
-def _material(visual: Any) -> Material:
-    """Phong terms of a trimesh visual; textures count with their mean colour.
-
-    Metallic-roughness materials become Phong ones: diffuse = base (1 - metallic), specular from
-    0.04 to base, exponent 2/α² - 2 with α = roughness² (Walter et al. 2007, eq. 33's match).
-    """
-    material = getattr(visual, "material", None)
-    if material is None:
-        return Material()
-    base = _mean_colour(getattr(material, "baseColorTexture", None))
-    factor = getattr(material, "baseColorFactor", None)
-    if factor is None:
-        factor = getattr(material, "main_color", None)
-    if factor is not None:
-        scale = 255.0 if np.asarray(factor).dtype.kind in "ui" else 1.0
-        base = base * np.asarray(factor, np.float64)[:3] / scale
-    metallic = _unit(getattr(material, "metallicFactor", None), 0.0)
-    alpha = max(_unit(getattr(material, "roughnessFactor", None), 0.6) ** 2, 0.03)
-    diffuse = np.clip(base * (1 - metallic), 0, 1)
-    specular = np.clip(0.04 * (1 - metallic) + base * metallic, 0, 1)
-    return Material(tuple(diffuse), tuple(specular), float(max(2 / alpha**2 - 2, 1.0)))
-
-
-def _mean_colour(texture: Any) -> np.ndarray:
-    if texture is None:
-        return np.ones(3)
-    srgb = np.asarray(texture.convert("RGB").resize((64, 64)), np.float64) / 255
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return np.asarray(linear.mean((0, 1)))
-
-
-def _unit(value: Any, default: float) -> float:
-    return default if value is None else float(np.clip(value, 0, 1))

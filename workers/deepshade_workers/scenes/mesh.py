@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from deepshade_workers.scenes.bitmap import Bitmap
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -36,12 +39,36 @@ class Object(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Paint:
+    """Textures of a mesh: at each corner `uv` (F, 3, 2) and a linear `colour` (F, 3, 3).
+
+    `bitmap` (F,) says which of `bitmaps` lies on a face, times the colour; where it is -1 none
+    does, and the face's row of `Mesh.materials` counts.
+    """
+
+    uv: Floats
+    colour: Floats
+    bitmap: Ints
+    bitmaps: tuple[Bitmap, ...]
+
+    @classmethod
+    def none(cls, count: int) -> Paint:
+        """That of `count` faces without textures."""
+        return cls(np.zeros((count, 3, 2)), np.ones((count, 3, 3)), np.full(count, -1), ())
+
+    def part(self, keep: NDArray[np.bool_] | Ints) -> Paint:
+        """That of some of the faces."""
+        return replace(self, uv=self.uv[keep], colour=self.colour[keep], bitmap=self.bitmap[keep])
+
+
+@dataclass(frozen=True)
 class Mesh:
     """Triangles with a normal per corner.
 
     `vertices` (V, 3), `faces` (F, 3) indices, `normals` (F, 3, 3) one unit normal per corner,
     `materials` (F, 10) rows of `Material.row`. Counter-clockwise faces look outward. `objects`
-    follow each other and hold all faces; none where the mesh is part of an object.
+    follow each other and hold all faces; none where the mesh is part of an object. `notes` say
+    what of the file could not be had.
     """
 
     vertices: Floats
@@ -49,6 +76,8 @@ class Mesh:
     normals: Floats
     materials: Floats = field(repr=False)
     objects: tuple[Object, ...] = ()
+    paint: Paint | None = field(default=None, repr=False)
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def build(
@@ -59,8 +88,9 @@ class Mesh:
         crease: float = 30.0,
         material: Material | None = None,
         vertex_normals: Floats | None = None,
+        paint: Paint | None = None,
     ) -> Mesh:
-        """Make a mesh, dropping degenerate and non-finite triangles.
+        """Make a mesh, dropping degenerate and non-finite triangles; `paint` is of all `faces`.
 
         Without `vertex_normals` (V, 3), edges sharper than `crease` degrees stay sharp; 0 gives
         flat faces and 180 smooths everything.
@@ -83,7 +113,28 @@ class Mesh:
         good = np.isfinite(length) & (length > 1e-8)
         corner = np.where(good, corner / np.where(good, length, 1), flat[:, None])
         rows = np.tile((material or Material()).row(), (len(faces), 1))
-        return cls(vertices, faces, corner, rows)
+        return cls(vertices, faces, corner, rows, paint=paint and paint.part(keep))
+
+    @classmethod
+    def of_file(
+        cls,
+        vertices: Floats,
+        faces: Ints,
+        normals: Floats | None,
+        *,
+        material: Material | None = None,
+        paint: Paint | None = None,
+    ) -> Mesh:
+        """A mesh with a file's normals (V, 3); without, edges sharper than 40° stay sharp."""
+        if normals is not None and len(normals) == len(vertices):
+            return cls.build(
+                vertices, faces, vertex_normals=normals, material=material, paint=paint
+            )
+        # vertices at the same place become one, so that normals smooth across texture seams
+        unique, place = np.unique(vertices, axis=0, return_inverse=True)
+        return cls.build(
+            unique, place.reshape(-1)[faces], crease=40, material=material, paint=paint
+        )
 
     def transformed(self, matrix: Floats) -> Mesh:
         """Apply a (4, 4) affine `matrix`; normals follow the inverse transpose."""
@@ -94,13 +145,18 @@ class Mesh:
         moved = replace(self, vertices=vertices, normals=normals)
         return moved.flipped() if np.linalg.det(linear) < 0 else moved
 
-    def part(self, keep: NDArray[np.bool_]) -> Mesh:
-        """The faces of which `keep` (F,) says so, of no object."""
-        return Mesh(self.vertices, self.faces[keep], self.normals[keep], self.materials[keep])
+    def part(self, keep: NDArray[np.bool_] | Ints) -> Mesh:
+        """The faces of which `keep` (F,) says so, or that it names, of no object."""
+        paint = self.paint and self.paint.part(keep)
+        kept = self.faces[keep], self.normals[keep], self.materials[keep]
+        return Mesh(self.vertices, *kept, paint=paint)
 
     def flipped(self) -> Mesh:
         """The same triangles with their corners in the other order, and so facing the other way."""
-        return replace(self, faces=self.faces[:, ::-1], normals=self.normals[:, ::-1])
+        paint = self.paint
+        if paint is not None:
+            paint = replace(paint, uv=paint.uv[:, ::-1], colour=paint.colour[:, ::-1])
+        return replace(self, faces=self.faces[:, ::-1], normals=self.normals[:, ::-1], paint=paint)
 
 
 def merge(meshes: Iterable[Mesh], names: Sequence[str] = ()) -> Mesh:
@@ -123,6 +179,24 @@ def merge(meshes: Iterable[Mesh], names: Sequence[str] = ()) -> Mesh:
         np.concatenate([part.normals for part in parts]),
         np.concatenate([part.materials for part in parts]),
         tuple(objects),
+        _merged_paint(parts),
+        tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+    )
+
+
+def _merged_paint(parts: Sequence[Mesh]) -> Paint | None:
+    """One table of bitmaps for all: equal ones, such as a pack's palette, are there once."""
+    if all(part.paint is None for part in parts):
+        return None
+    paints = [part.paint or Paint.none(len(part.faces)) for part in parts]
+    bitmaps = {bitmap.key: bitmap for paint in paints for bitmap in paint.bitmaps}
+    places = {key: place for place, key in enumerate(bitmaps)}
+    tables = [np.array([*(places[b.key] for b in paint.bitmaps), -1]) for paint in paints]
+    return Paint(
+        np.concatenate([paint.uv for paint in paints]),
+        np.concatenate([paint.colour for paint in paints]),
+        np.concatenate([table[paint.bitmap] for table, paint in zip(tables, paints, strict=True)]),
+        tuple(bitmaps.values()),
     )
 
 

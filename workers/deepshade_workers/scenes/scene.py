@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from deepshade.errors import SceneError, nearest
 from deepshade_workers.backend import mitsuba
-from deepshade_workers.scenes.mesh import Floats, Ints, Mesh, Object
+from deepshade_workers.scenes.mesh import Floats, Ints, Mesh, Object, Paint
 from deepshade_workers.view import Vector
+
+if TYPE_CHECKING:
+    from deepshade_workers.painting import Painting
 
 # A distant sun and a dim sky: what lights a scene that brings no lights of its own.
 SUN_DIRECTION = (-0.45, -0.75, -0.5)
@@ -31,7 +34,7 @@ class Scene:
     hit. A Mitsuba XML scene tells none.
     Its `mesh` is kept, for what moves is traced by itself; None for an XML scene.
     `points` (n, 3) are places worth looking at, `extent` the size of the region they cover:
-    a town on a wide plain is as large as the town.
+    a town on a wide plain is as large as the town. `painting` holds its textures.
     """
 
     name: str
@@ -42,6 +45,12 @@ class Scene:
     lit: bool = False
     objects: tuple[Object, ...] = ()
     mesh: Mesh | None = field(default=None, repr=False)
+    painting: Painting | None = field(default=None, repr=False)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What of its files could not be had."""
+        return () if self.mesh is None else self.mesh.notes
 
     @property
     def diagonal(self) -> float:
@@ -110,7 +119,11 @@ class Scene:
         # Where the triangles are small there is something to see; large ones are floors.
         points = mesh.vertices[mesh.faces[:: max(1, len(mesh.faces) // 4096)]].mean(1)
         objects = mesh.objects or (Object(name, 0, len(mesh.faces)),)
-        return cls(name, traced, bounds, points, _spread(points), objects=objects, mesh=mesh)
+        extent = _spread(points)
+        painting = _painting(mesh)
+        return cls(
+            name, traced, bounds, points, extent, objects=objects, mesh=mesh, painting=painting
+        )
 
     @classmethod
     def from_xml(cls, path: Path) -> Scene:
@@ -150,15 +163,45 @@ def _shape(mi: Any, name: str, mesh: Mesh, numbers: Ints) -> Any:
     count = len(mesh.faces)
     props = mi.Properties()
     props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse"}})
-    shape = mi.Mesh(name, len(corners), count, has_vertex_normals=True, props=props)
+    shape = mi.Mesh(
+        name,
+        len(corners),
+        count,
+        has_vertex_normals=True,
+        has_vertex_texcoords=mesh.paint is not None,
+        props=props,
+    )
     for channel, (start, stop) in MATERIAL_CHANNELS.items():
         values = np.ascontiguousarray(mesh.materials[:, start:stop], np.float32)
         shape.add_attribute(f"face_{channel}", stop - start, values.ravel())
     # Numbers up to 2^24 are exact in float32.
     shape.add_attribute("face_object", 1, numbers.astype(np.float32))
+    if mesh.paint is not None:
+        _add_paint(shape, mesh, mesh.paint)
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(corners.ravel())
     params["vertex_normals"] = mi.Float(mesh.normals.astype(np.float32).ravel())
+    if mesh.paint is not None:
+        params["vertex_texcoords"] = mi.Float(mesh.paint.uv.astype(np.float32).ravel())
     params["faces"] = mi.UInt32(np.arange(3 * count, dtype=np.uint32))
     params.update()
     return shape
+
+
+def _painting(mesh: Mesh) -> Painting | None:
+    if mesh.paint is None or not mesh.paint.bitmaps:
+        return None
+    from deepshade_workers.painting import Painting
+
+    return Painting.of(mesh.paint.bitmaps, bool((mesh.paint.colour != 1).any()))
+
+
+def _add_paint(shape: Any, mesh: Mesh, paint: Paint) -> None:
+    """Of faces their bitmap and how often it repeats in a unit of length; corners' colours."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    (ux, uy), (vx, vy) = ((paint.uv[:, k] - paint.uv[:, 0]).T for k in (1, 2))
+    density = np.sqrt(np.abs(ux * vy - uy * vx) / np.maximum(area, 1e-30))
+    shape.add_attribute("face_bitmap", 1, paint.bitmap.astype(np.float32))
+    shape.add_attribute("face_density", 1, density.astype(np.float32))
+    shape.add_attribute("vertex_colour", 3, paint.colour.astype(np.float32).ravel())

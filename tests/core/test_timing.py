@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepshade_report.timing import Pace, alternate, ratio, spread
+from deepshade.timing import Pace, alternate, ratio, spread
 
 values = st.floats(1e-3, 1e6)
 
