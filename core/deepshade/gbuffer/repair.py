@@ -19,7 +19,8 @@ from deepshade.camera import Camera, rotation_of
 Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-ROUNDS = 60  # of Jacobi's method
+ROUNDS = 40  # of Jacobi's method
+_STRIP = 96  # rows worked on at a time, beside those that may tell of them
 _ENOUGH = 200  # pixels that a step, or how it was rounded, is told by
 _GRAZING = 0.02  # cosine below which a normal's plane says nothing of depth
 _SLACK = 0.25  # of an interval: its ends are as exact as the pixels' rays
@@ -102,45 +103,26 @@ def steps_of(
     return Steps(step, (x, y, z), towards_zero)
 
 
-@dataclass(frozen=True, slots=True)
-class View:
-    """How positions are seen, in their own space: along `rays` (3, H, W), of length 1 along the
-    view axis, from the `eye` (3,)."""
+def intervals(
+    stored: NDArray[Any], rays: NDArray[Any], eye: NDArray[np.float64], steps: Steps
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """(least, greatest) planar depth that `stored` positions (3, ...) may have, where x, y and z
+    agree; the least is above the greatest where they don't.
 
-    rays: Float
-    eye: NDArray[np.float64]
-
-
-def repaired(
-    stored: Float,
-    view: View,
-    steps: Steps,
-    valid: Mask,
-    normals: tuple[Float, Float] | None,
-    *,
-    rounds: int = ROUNDS,
-) -> Float | None:
-    """Planar depths (H, W) of `stored` positions (3, H, W), 0 where not `valid`, or None.
-
-    `normals` are those (3, H, W) of the surfaces and the rays in their space, which need not be the
-    positions'; without them only the intervals are intersected. None where the positions don't lie
-    on the rays, within their steps.
+    They are seen along `rays` (3, ...), of length 1 along the view axis, from the `eye` (3,).
     """
-    low, high = np.zeros(valid.shape, np.float32), np.full(valid.shape, np.inf, np.float32)
-    with np.errstate(all="ignore"):
-        for axis in range(3):
-            values, ray = stored[axis], view.rays[axis]
-            step = steps.of(values, axis)
-            bias = np.float32(steps.bias[axis])
-            sign = np.where(values < 0, -bias, bias) if steps.towards_zero else bias
-            middle = (values - sign * step - np.float32(view.eye[axis])) / ray
-            wide = np.abs((0.5 + _SLACK) * step / ray)
-            np.fmax(low, middle - wide, out=low)
-            np.fmin(high, middle + wide, out=high)
-        met = np.count_nonzero((low <= high) & valid)
-        if met < _CONSISTENT * np.count_nonzero(valid):
-            return None
-        return between(np.fmin(low, high), np.fmax(low, high), valid, normals, rounds=rounds)
+    low = np.zeros(stored.shape[1:], np.float32)
+    high = np.full(stored.shape[1:], np.inf, np.float32)
+    for axis in range(3):
+        values, ray = stored[axis], rays[axis]
+        step = steps.of(values, axis)
+        bias = np.float32(steps.bias[axis])
+        sign = np.where(values < 0, -bias, bias) if steps.towards_zero else bias
+        middle = (values - sign * step - np.float32(eye[axis])) / ray
+        wide = np.abs((0.5 + _SLACK) * step / ray)
+        np.fmax(low, middle - wide, out=low)
+        np.fmin(high, middle + wide, out=high)
+    return low, high
 
 
 def between(
@@ -151,7 +133,10 @@ def between(
     *,
     rounds: int = ROUNDS,
 ) -> Float:
-    """Smooth depths (H, W) between `low` and `high`, 0 where not `valid`; else as `repaired`."""
+    """Smooth depths (H, W) between `low` and `high`, 0 where not `valid`.
+
+    `normals` are those (3, H, W) of the surfaces, and the pixels' rays in their space.
+    """
     with np.errstate(all="ignore"):
         usable = valid & (low > 0) & np.isfinite(high)
         depth = 0.5 * (low + high)
@@ -277,19 +262,42 @@ def repair(
         return {}
     inverse = np.linalg.inv(linear)
     eye = -inverse @ offset
-    for rays in _rays(camera, seen, pixels, valid.shape, coarse):
-        there = np.tensordot(inverse, rays, 1).astype(np.float32)
-        known = steps_of(some, there.reshape(3, -1)[:, pixels], eye, steps.step)
-        normals = _normals(arrays, rays, matrix)
-        depth = repaired(arrays[name], View(there, eye), known, valid, normals)
-        if depth is None:
-            continue
-        good = depth > 0
-        for axis in range(3):
-            placed = there[axis] * depth + np.float32(eye[axis])
-            np.copyto(arrays[name][axis], placed, where=good)
+    for slopes in _rays(camera, seen, pixels, valid.shape, coarse):
+        there = inverse @ _of(slopes, valid.shape, pixels)
+        known = steps_of(some, there, eye, steps.step)
+        with np.errstate(all="ignore"):
+            low, high = intervals(some, there, eye, known)
+        if (low <= high).mean() < _CONSISTENT:
+            continue  # they don't lie on these rays, within their steps
+        turned = inverse.astype(np.float32)
+        depth = np.empty(valid.shape, np.float32)
+        for inner, rows, kept in _strips(valid.shape[0]):
+            rays = _strip(slopes, rows)
+            with np.errstate(all="ignore"):
+                given = np.tensordot(turned, rays, 1)
+                low, high = intervals(arrays[name][:, rows], given, eye, known)
+                low, high = np.fmin(low, high), np.fmax(low, high)
+            normals = _normals(arrays, rays, matrix, rows)
+            depth[inner] = between(low, high, valid[rows], normals)[kept]
+        for rows, _, _ in _strips(valid.shape[0]):
+            given = np.tensordot(turned, _strip(slopes, rows), 1)
+            for axis in range(3):
+                placed = given[axis] * depth[rows] + np.float32(eye[axis])
+                np.copyto(arrays[name][axis, rows], placed, where=depth[rows] > 0)
         return {name: f"stored in steps of {coarse:.2g}; smoothed within them"}
     return {}
+
+
+def _strips(height: int) -> Iterator[tuple[slice, slice, slice]]:
+    """Rows, those that tell of them, and the first among the second: so that whole pictures and
+    strips come out alike, in less memory."""
+    for top in range(0, height, _STRIP):
+        end, above = min(top + _STRIP, height), max(top - ROUNDS, 0)
+        yield (
+            slice(top, end),
+            slice(above, min(end + ROUNDS, height)),
+            slice(top - above, end - above),
+        )
 
 
 def _depth(
@@ -308,24 +316,54 @@ def _depth(
     coarse = float(np.median(known.of(some, 0)))
     if not coarse > (radius or _SHARE * float(np.median(some))) / _FINE_DEPTH:
         return {}
-    depth = arrays["depth"][0]
-    size = known.of(depth, 0)
-    normals = _normals(arrays, camera.rays(*valid.shape[::-1]), matrix)
-    smooth = between(depth - (0.5 + _SLACK) * size, depth + (1 + _SLACK) * size, valid, normals)
-    np.copyto(depth, smooth, where=smooth > 0)
+    stored = arrays["depth"][0]
+    slopes = _slopes(camera, valid.shape)
+    depth = np.empty(valid.shape, np.float32)
+    for inner, rows, kept in _strips(valid.shape[0]):
+        values = stored[rows]
+        size = known.of(values, 0)
+        normals = _normals(arrays, _strip(slopes, rows), matrix, rows)
+        ends = values - (0.5 + _SLACK) * size, values + (1 + _SLACK) * size
+        depth[inner] = between(*ends, valid[rows], normals)[kept]
+    np.copyto(stored, depth, where=depth > 0)
     return {"depth": f"stored in steps of {coarse:.2g}; smoothed within them"}
 
 
 def _normals(
-    arrays: Mapping[str, Float], rays: Float, matrix: NDArray[np.float64] | None
+    arrays: Mapping[str, Float], rays: Float, matrix: NDArray[np.float64] | None, rows: slice
 ) -> tuple[Float, Float] | None:
-    """Normals, and the camera's rays in their space."""
+    """Normals of some rows, and the camera's rays in their space."""
     if "normal" in arrays:
-        return arrays["normal"], rays
+        return arrays["normal"][:, rows], rays
     if "normal_world" in arrays and matrix is not None:
-        turned = np.tensordot(rotation_of(matrix).T, rays, 1).astype(np.float32)
-        return arrays["normal_world"], turned
+        turned = np.tensordot(rotation_of(matrix).T.astype(np.float32), rays, 1)
+        return arrays["normal_world"][:, rows], turned
     return None
+
+
+# x / -z of a picture's columns (W,), and y / -z of its rows (H,)
+_Slopes = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def _slopes(camera: Camera, shape: Any) -> _Slopes:
+    height, width = shape
+    none = np.zeros(1, np.intp)
+    x = camera.rays_at(np.arange(width), np.broadcast_to(none, width))[0]
+    return x, camera.rays_at(np.broadcast_to(none, height), np.arange(height))[1]
+
+
+def _of(slopes: _Slopes, shape: Any, pixels: NDArray[np.intp]) -> NDArray[np.float64]:
+    """The rays (3, N) of `pixels`."""
+    x, y = slopes[0][pixels % shape[1]], slopes[1][pixels // shape[1]]
+    return np.stack([x, y, np.full(x.shape, -1.0)])
+
+
+def _strip(slopes: _Slopes, rows: slice) -> Float:
+    """The rays (3, h, W) of some rows."""
+    x, y = slopes[0], slopes[1][rows]
+    rays = np.full((3, y.size, x.size), -1, np.float32)
+    rays[0], rays[1] = x, y[:, None]
+    return rays
 
 
 def _rays(
@@ -334,17 +372,16 @@ def _rays(
     pixels: NDArray[np.intp],
     shape: Any,
     coarse: float,
-) -> Iterator[Float]:
-    """The rays (3, H, W) that positions in camera space may lie on: the camera's; their own."""
+) -> Iterator[_Slopes]:
+    """The rays that positions in camera space may lie on: the camera's; their own."""
     height, width = shape
     if camera is not None:
-        yield camera.rays(width, height)
-    rays = np.full((3, height, width), -1, np.float32)
-    for axis, at, size in ((0, pixels % width, width), (1, pixels // width, height)):
-        line = _own(seen[axis], -seen[2], at, coarse)
-        along = line[0] * np.arange(size) + line[1]
-        rays[axis] = along if axis == 0 else along[:, None]
-    yield rays
+        yield _slopes(camera, shape)
+    x, y = (
+        _own(seen[axis], -seen[2], at, coarse)
+        for axis, at in enumerate(divmod(pixels, width)[::-1])
+    )
+    yield x[0] * np.arange(width) + x[1], y[0] * np.arange(height) + y[1]
 
 
 def _own(
