@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import email.utils
+import re
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -117,8 +118,11 @@ def shade_request(
     names = effects if isinstance(effects, str) else ",".join(effects)
     request = {"method": "POST", "url": f"shade/{quote(names, safe=',')}", "params": query}
     if isinstance(picture, (str, bytes, Path)):
-        _, data = _named(picture)
-        return request | {"content": data, "headers": {"Content-Type": EXR}}
+        name, data = _named(picture)
+        headers = {"Content-Type": EXR}
+        if re.fullmatch(r"[\w. #%+-]+", name, re.ASCII):  # what any header may hold
+            headers["Content-Disposition"] = f'attachment; filename="{name}"'
+        return request | {"content": data, "headers": headers}
     named = picture.items() if isinstance(picture, Mapping) else [("image", s) for s in picture]
     files = [(field, (*_named(source), EXR)) for field, source in named]
     return request | {"files": files}

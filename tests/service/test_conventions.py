@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from deepshade import exr
 
+CASES = Path(__file__).parents[1] / "cases"
 EXR = {"Content-Type": "image/x-exr"}
 FOV = {"deepshade:fov": float(np.degrees(2 * np.arctan(0.5)))}  # that of the pictures
 
@@ -20,6 +22,14 @@ def answer(client, body, query=""):
 def pixels(response):
     assert response.status_code == 200, response.text
     return exr.read(response.content).pixels["Y"]
+
+
+def test_a_body_may_be_named_as_a_file_is(client):
+    content = (CASES / "shot_depth_Y.exr").read_bytes()
+    for name, status in (("shot_depth_Y.exr", 200), ("shot.exr", 422)):
+        headers = EXR | {"Content-Disposition": f'attachment; filename="{name}"'}
+        found = client.post("/shade/ao?radius=0.5", content=content, headers=headers)
+        assert found.status_code == status
 
 
 def scaled(picture, name, factors):
