@@ -79,7 +79,7 @@ def plan(
     is_folder = _is_folder(out)
     files = _find(inputs, Path(out).resolve() if is_folder else None)
     found = sequences.views(files, together=together)
-    if "{" in out or sequences.is_pattern(out):
+    if "{" in out or (not is_folder and sequences.is_pattern(out)):
         targets = [_fill(out, view, effect) for view in found]
     elif is_folder or len(found) > 1:
         if Path(out).suffix.lower() in SUFFIXES and not is_folder:
@@ -149,13 +149,23 @@ async def run(
 
     Errors become results. When nothing answers at the server's address, what hasn't started
     isn't tried. With `skip` what `is_done` is left as it is. A radius that follows from depth is
-    that of a sequence's first frame in all of them: from frame to frame it would flicker.
+    that of a sequence's first frame that has an answer in all of them: from frame to frame it
+    would flicker.
     """
     queue = iter(tasks)
     results: list[Result] = []
     unreachable = False
     follows = options.radius is None or str(options.radius).strip().endswith("%")
     radii: dict[Path, asyncio.Future[str | None]] = {}
+
+    async def agreed(sequence: Path) -> str | None:
+        """The radius of its first frame, "" for its own in each; None: the asker is the first."""
+        while known := radii.get(sequence):
+            if (radius := await known) is not None:
+                return radius
+            if radii.get(sequence) is known:  # it failed, and the next one takes its place
+                del radii[sequence]
+        return None
 
     async def work() -> None:
         nonlocal unreachable
@@ -164,14 +174,16 @@ async def run(
                 return
             settings, first = options, None
             if task.sequence and follows:
-                if known := radii.get(task.sequence):
-                    settings = replace(options, radius=await known or options.radius)
-                else:
+                radius = await agreed(task.sequence)
+                if unreachable:
+                    return
+                if radius is None:
                     first = radii[task.sequence] = asyncio.get_running_loop().create_future()
+                settings = replace(options, radius=radius or options.radius)
             start = time.perf_counter()
             saved: Saved | None = None
             failure: Exception | None = None
-            radius: str | None = None
+            radius = None
             try:
                 if task.lacks:
                     raise _lacking(task)
@@ -200,17 +212,17 @@ async def run(
 
 
 def _radius_of(answer: Path) -> str | None:
-    """That which a saved answer names."""
+    """As `_radius_among`, of a saved answer; None where that doesn't tell."""
     if answer.suffix.lower() != ".exr":
         return None
     return _radius_among(exr.read_header(answer).parts[0].attributes, ":")
 
 
-def _radius_among(facts: Mapping[str, object], between: str) -> str | None:
-    """That of one effect, or of the first of several, if neither header nor bundle gave it."""
+def _radius_among(facts: Mapping[str, object], between: str) -> str:
+    """That of one effect, or of the first of several; "" if its header or the bundle gave it."""
     names = (name for name in facts if name.split(between)[-1] == "radius")
     known = (k for k in names if facts.get(f"{k}_source") in ("depth", "request"))
-    return next((str(facts[k]) for k in known), None)
+    return next((str(facts[k]) for k in known), "")
 
 
 def _lacking(task: Task) -> UsageError:

@@ -36,8 +36,8 @@ class View:
 
 
 def is_pattern(text: str) -> bool:
-    """Whether it stands for numbered files."""
-    return _NUMBER.search(text) is not None
+    """Whether it stands for numbered files: the last part of the path holds a number's place."""
+    return _NUMBER.search(Path(text).name) is not None
 
 
 def matches(pattern: str) -> list[Path]:
@@ -65,7 +65,9 @@ def matches(pattern: str) -> list[Path]:
 
 def numbered(pattern: str, frame: int) -> str:
     """The pattern with the frame's number in place of `####` or `%04d`."""
-    return _NUMBER.sub(lambda m: f"{frame:0{len(m[1] or '') or int(m[2] or 1)}d}", pattern)
+    path = Path(pattern)
+    name = _NUMBER.sub(lambda m: f"{frame:0{len(m[1] or '') or int(m[2] or 1)}d}", path.name)
+    return str(path.with_name(name))
 
 
 def views(files: Mapping[Path, Path], *, together: bool | None = None) -> list[View]:

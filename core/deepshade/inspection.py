@@ -296,7 +296,7 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
         table.add_row(name, _safe(where), str(row.get("nonfinite", "")), _values(row))
     derived = {n: how for each in report["effects"].values() for n, how in each["derived"].items()}
     for name, how in derived.items():
-        table.add_row(name, how)
+        table.add_row(name, _safe(how))
     for name, candidates in report["ambiguous"].items():
         table.add_row(name, f"[yellow]ambiguous:[/yellow] {_safe(', '.join(candidates))}")
     console.print(table)

@@ -11,9 +11,12 @@ import typer
 def report(
     out: Annotated[Path, typer.Option(help="Folder to write to.")] = Path("out/report"),
     data: Annotated[
-        Path,
-        typer.Option(help="Held-out views: a folder of 'deepshade datagen', or of EXR files."),
-    ] = Path("samples"),
+        Path | None,
+        typer.Option(
+            help="Held-out views: a folder of 'deepshade datagen', or of EXR files. "
+            "Default: the shipped samples."
+        ),
+    ] = None,
     models: Annotated[
         Path | None,
         typer.Option(help="Folder of bundles, <effect>/<name>/. Default: as 'deepshade serve'."),
@@ -38,8 +41,8 @@ def report(
 ) -> None:
     """Measure speed against error on this machine; write a page, plots and JSON.
 
-    About eight minutes on two cores. Ctrl-C keeps what is done: --resume goes on. The samples of a
-    clone, the default, tell the speed; an error to be quoted needs a data set.
+    About eight minutes on two cores. Ctrl-C keeps what is done: --resume goes on.
+    The shipped samples are enough for speeds; an error to be quoted needs a data set.
 
       deepshade report --data data/test
 
@@ -53,6 +56,7 @@ def report(
     from deepshade.bundles import bundle_root
     from deepshade.effects import EFFECTS
     from deepshade.errors import ConfigError, DataError
+    from deepshade.files import shipped
     from deepshade.machine import cpu_count
     from deepshade_report.context import Context
     from deepshade_report.report import SECTIONS, measure
@@ -64,7 +68,8 @@ def report(
     if effect not in EFFECTS:
         raise ConfigError(effect, EFFECTS, detail=f"no effect is called '{effect}'")
     threads = threads or cpu_count()
-    context = Context(models or bundle_root(), data, out, paper, effect, threads, quick, views)
+    models, data = models or bundle_root(), data or shipped("samples")
+    context = Context(models, data, out, paper, effect, threads, quick, views)
     console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), TextColumn("{task.fields[doing]}"))
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:

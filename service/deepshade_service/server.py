@@ -31,7 +31,7 @@ class Server(uvicorn.Server):
         self._loop = asyncio.get_running_loop()
         await super().serve(sockets)
         # A library that compiles a network can't be interrupted, and Python would wait for it.
-        _end(0)
+        _end(0 if self.started else 1)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """As uvicorn's, and at Ctrl-C nobody waits for what loads."""

@@ -71,6 +71,12 @@ class TestPlan:
         tasks = self.plan([views / "a.exr", views / "b.exr"], tmp_path / "{name}_{effect}.exr")
         assert [task.target.name for task in tasks] == ["a_ao.exr", "b_ao.exr"]
 
+    def test_a_number_sign_in_a_folder_is_no_frame(self, views, tmp_path):
+        (views / "a.0007.exr").write_bytes(b"")
+        for out in ("take#2/", "take#2/x.##.exr"):
+            (task,) = self.plan([views / "a.0007.exr"], f"{tmp_path}/{out}")
+            assert task.target.parent == tmp_path / "take#2"
+
     def test_the_same_file_twice_is_shaded_once(self, views, tmp_path):
         assert len(self.plan([views / "a.exr", views / "a.exr"], f"{tmp_path}/out/")) == 1
 
@@ -255,8 +261,8 @@ def test_a_sequence_has_one_radius(run, make_exr, make_picture, tmp_path):
         (tmp_path / f"s.{frame:04d}.exr").write_bytes(make_exr(picture))
     out = tmp_path / "out.####.exr"
 
-    def radii(*options):
-        run("shade", "ao", tmp_path / "s.####.exr", "-o", out, *options)
+    def radii(*options, code=0):
+        run("shade", "ao", tmp_path / "s.####.exr", "-o", out, *options, code=code)
         headers = [exr.read_header(path) for path in sorted(tmp_path.glob("out.*"))]
         return [header.parts[0].attributes["deepshade:radius"] for header in headers]
 
@@ -265,6 +271,10 @@ def test_a_sequence_has_one_radius(run, make_exr, make_picture, tmp_path):
     (tmp_path / "out.0003.exr").unlink()
     assert radii("--skip-existing") == [first] * 3
     assert radii("--radius", "15%") == [first] * 3
+    for path in tmp_path.glob("out.*"):
+        path.unlink()
+    (tmp_path / "s.0001.exr").write_bytes(b"damaged")
+    assert radii(code=1) == [pytest.approx(2 * first, rel=1e-3)] * 2  # of the first one shaded
 
 
 def test_no_frame_number(run, views, tmp_path):

@@ -6,6 +6,7 @@ from importlib.metadata import EntryPoint, version
 from pathlib import Path
 
 import pytest
+from rich.text import Text
 
 from deepshade import cli
 from deepshade.errors import DeepshadeError
@@ -63,6 +64,14 @@ def test_every_help_has_an_example(capsys):
     group = cli.application()
     for name in group.list_commands(None):
         assert f"deepshade {name} " in group.get_command(None, name).help, name
+
+
+def test_no_part_of_a_help_is_taken_for_markup():
+    group = cli.application()
+    for name in group.list_commands(None):
+        command = group.get_command(None, name)
+        for text in filter(None, (command.help, *(p.help for p in command.params))):
+            assert Text.from_markup(text).plain == text, name
 
 
 def test_help_lists_every_installed_command(capsys):

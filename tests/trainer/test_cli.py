@@ -97,6 +97,7 @@ def test_names_of_scenes_leave_out_the_folders_they_share() -> None:
     assert short_names(["/a/b/c.obj", "/a/b/c.obj"]) == ["c.obj", "c.obj"]
     assert short_names(["a/b/c.obj", "a/d/c.obj"]) == ["b/c.obj", "d/c.obj"]
     assert short_names(["/a/b.obj", "procedural:room:7"]) == ["b.obj", "procedural:room:7"]
+    assert short_names(["/a/b.obj", "a/c.obj"]) == ["/a/b.obj", "a/c.obj"]
     assert short_names(["compose:x/a+y/b:3", "c.obj"]) == ["compose:x/a+y/b:3", "c.obj"]
 
 

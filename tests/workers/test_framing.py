@@ -28,6 +28,13 @@ def scene(*parts: Any, inward: bool = False) -> Scene:
     return Scene.from_mesh("made", Mesh.build(whole.vertices, faces, crease=0))
 
 
+def test_a_plane_is_framed_though_no_ray_from_its_box_meets_it(tmp_path: Path) -> None:
+    path = tmp_path / "plane.xml"
+    path.write_text('<scene version="3.0.0"><shape type="rectangle"/></scene>')
+    view = frame(Scene.from_xml(path), 50, 48, 32)
+    assert view.eye[2] > 0  # its front
+
+
 def test_an_object_is_seen_whole_from_outside() -> None:
     found = scene(trimesh.creation.icosphere(radius=3).apply_translation((100, 200, -50)))
     view = frame(found, 50, 64, 48)

@@ -328,6 +328,13 @@ def test_an_obj_is_what_its_mtl_says(tmp_path: Path) -> None:
     assert mesh.notes == ()
 
 
+def test_an_mtl_may_have_tabs_comments_and_number_signs_in_names(tmp_path: Path) -> None:
+    mtl = "# a comment\nnewmtl\tMaterial #25\n\tKd\t0.5 0.25 0.125  # brown\n#Kd 1 1 1\n"
+    mesh = obj(tmp_path, "Material #25", mtl=mtl)
+    assert mesh.materials[0][:3] == pytest.approx([0.5, 0.25, 0.125])
+    assert mesh.notes == ()
+
+
 def test_map_kd_is_read_by_coordinates_from_below(tmp_path: Path) -> None:
     (tmp_path / "my palette.png").write_bytes(png([[RED, GREEN], [BLUE, GREY]]))
     mesh = obj(tmp_path, "painted", "glass")

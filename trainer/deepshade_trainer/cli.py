@@ -154,7 +154,7 @@ def export(
         list[Path] | None, typer.Option(help="Test data for the model card; repeatable.")
     ] = None,
     radius: Annotated[
-        float, typer.Option(help="Effect radius of requests that name none, scene units.")
+        float, typer.Option(help="Effect radius where a picture has no depth, scene units.")
     ] = 1.0,
     note: Annotated[Path | None, typer.Option(help="Text that ends the model card.")] = None,
     to: Annotated[str, typer.Option(help="'onnx': a bundle's graph for another program.")] = "",

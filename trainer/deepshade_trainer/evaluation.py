@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -185,7 +186,9 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 def short_names(names: Sequence[str]) -> list[str]:
     """Scenes' names without the folders that all of them that are files share."""
     files = [name for name in names if "/" in name and Path(name).suffix]
-    shared = os.path.commonpath([str(Path(name).parent) for name in files]) if files else ""
+    shared = ""
+    with suppress(ValueError):  # no files, or some by absolute paths and some by relative ones
+        shared = os.path.commonpath([str(Path(name).parent) for name in files])
     return [str(Path(n).relative_to(shared)) if n in files and shared else n for n in names]
 
 

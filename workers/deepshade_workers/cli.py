@@ -32,22 +32,22 @@ def render(
     output: Annotated[Path, typer.Option("--output", "-o", help="EXR file to write.")],
     eye: Annotated[
         Vector | None,
-        typer.Option(help="The camera's place, scene units.  [default: where most is seen from]"),
+        typer.Option(help="The camera's place, scene units. Default: where most is seen from."),
     ] = None,
     target: Annotated[
-        Vector | None, typer.Option(help="What it looks at.  [default: the scene's middle]")
+        Vector | None, typer.Option(help="What it looks at. Default: the scene's middle.")
     ] = None,
     up: Annotated[Vector, typer.Option(help="Upward direction.")] = (0.0, 1.0, 0.0),
     fov: Annotated[float, typer.Option(help="Full horizontal angle, degrees.")] = 50.0,
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "768x512",
     effects: Annotated[str, typer.Option(help="References to render, commas between.")] = "ao",
     radius: Annotated[
-        float | None, typer.Option(help="Effect radius, scene units.  [default: diagonal / 20]")
+        float | None, typer.Option(help="Effect radius, scene units. Default: diagonal / 20.")
     ] = None,
     spp: Annotated[int, typer.Option(help="Reference rays a pixel.", min=2, max=65536)] = 256,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     focus: Annotated[
-        float | None, typer.Option(help="Focus distance.  [default: that of the target]")
+        float | None, typer.Option(help="Focus distance. Default: that of the target.")
     ] = None,
     aperture: Annotated[float, typer.Option(help="Lens diameter, scene units.", min=0)] = 0.0,
     lamp: Annotated[
@@ -57,10 +57,10 @@ def render(
     lamp_size: Annotated[float, typer.Option(help="Its radius; 0 is a point.", min=0)] = 0.0,
     lamp_power: Annotated[
         float | None,
-        typer.Option(help="Its radiant intensity.  [default: irradiance 2 on the target]", min=0),
+        typer.Option(help="Its radiant intensity. Default: irradiance 2 on the target.", min=0),
     ] = None,
     sky: Annotated[
-        float | None, typer.Option(help="The sky's radiance.  [default: 0.3 with a lamp]", min=0)
+        float | None, typer.Option(help="The sky's radiance. Default: 0.3 with a lamp.", min=0)
     ] = None,
     move: Annotated[
         list[str] | None,
@@ -77,7 +77,7 @@ def render(
         float, typer.Option(help="Degrees to turn it by, counter-clockwise from above.")
     ] = 0.0,
     attributes: Annotated[
-        str, typer.Option(help="Attributes to write, commas between.  [default: all]")
+        str, typer.Option(help="Attributes to write, commas between. Default: all.")
     ] = "",
     layers: Annotated[
         str, typer.Option(help="More to render, commas between: do_directions.")
@@ -249,7 +249,7 @@ def datagen(
     size: Annotated[int, typer.Option(help="Side of a sample, pixels.", min=8, max=4096)] = 256,
     frame: Annotated[
         int | None,
-        typer.Option(help="Side of the view that samples are cut from.  [default: size]"),
+        typer.Option(help="Side of the view that samples are cut from. Default: size."),
     ] = None,
     spp: Annotated[int, typer.Option(help="Reference rays a pixel.", min=2)] = 256,
     seed: Annotated[int, typer.Option(min=0)] = 0,
@@ -257,13 +257,13 @@ def datagen(
         list[str] | None, typer.Option(help="Effects, commas between; repeatable.")
     ] = None,
     radius: Annotated[
-        float | None, typer.Option(help="Effect radius, scene units.  [default: drawn per view]")
+        float | None, typer.Option(help="Effect radius, scene units. Default: drawn per view.")
     ] = None,
     min_contrast: Annotated[
         float | None,
         typer.Option(
-            help="Least standard deviation of a view's occlusion.  [default: what is measured on: "
-            "0.12 with ao, else 0.06]"
+            help="Least standard deviation of a view's occlusion. Default: what counts when "
+            "measured, 0.12 with ao, else 0.06."
         ),
     ] = None,
     max_blur: Annotated[float, typer.Option(help="Largest blur circles drawn, pixels.")] = 48.0,
@@ -286,10 +286,10 @@ def datagen(
     ] = "",
     shard_size: Annotated[
         int | None,
-        typer.Option(help="Samples in a shard.  [default: views / 16, 128 at most]", min=1),
+        typer.Option(help="Samples in a shard. Default: views / 16, 128 at most.", min=1),
     ] = None,
     address: Annotated[
-        str | None, typer.Option(help="A running Ray cluster.  [default: one of its own]")
+        str | None, typer.Option(help="A running Ray cluster. Default: one of its own.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON summary.")] = False,
 ) -> None:

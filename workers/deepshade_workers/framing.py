@@ -127,7 +127,8 @@ def _surface_points(scene: Scene) -> Floats:
         mi.Vector3f((toward / np.linalg.norm(toward, axis=0)).astype(np.float32)),
     )
     hit = scene.traced.ray_intersect(ray)
-    return np.asarray(hit.p.numpy().T[hit.is_valid().numpy()], np.float64)
+    found = np.asarray(hit.p.numpy().T[hit.is_valid().numpy()], np.float64)
+    return found if len(found) else scene.points  # a plane: all rays from within it miss
 
 
 def _seen(

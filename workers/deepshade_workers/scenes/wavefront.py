@@ -77,11 +77,12 @@ def read_mtl(text: str, resources: Resources, used: Sequence[str]) -> dict[str, 
     found: dict[str, dict[str, str]] = {}
     terms: dict[str, str] = {}
     for line in text.splitlines():
-        key, _, rest = line.split("#")[0].strip().partition(" ")
+        # "#" within a word is of a name, such as "Material #25"; between may stand tabs
+        key, *rest = re.split(r"(?:^|\s)#(?:\s|$)", line)[0].split(None, 1)[:2] or [""]
         if key.lower() == "newmtl":
-            terms = found.setdefault(rest.strip(), {})
-        elif rest.strip():
-            terms[key.lower()] = rest.strip()
+            terms = found.setdefault("".join(rest).strip(), {})
+        elif rest:
+            terms[key.lower()] = rest[0].strip()
     return {name: _surface(found[name], resources) for name in used if name in found}
 
 
