@@ -19,7 +19,7 @@ from deepshade.camera import Camera, rotation_of
 Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-ROUNDS = 40  # of Jacobi's method
+ROUNDS = 60  # of Jacobi's method
 _STRIP = 96  # rows worked on at a time, beside those that may tell of them
 _ENOUGH = 200  # pixels that a step, or how it was rounded, is told by
 _GRAZING = 0.02  # cosine below which a normal's plane says nothing of depth
