@@ -158,6 +158,14 @@ def test_contradictions_name_what_helps():
         load_gbuffer(encode(normal=np.full_like(N, np.nan), position=P), NEEDS)
 
 
+def test_what_may_be_zero_everywhere():
+    zero = {f"{name}.{band}": 0 * Z for name in ("scatter", "light") for band in "RGB"}
+    needs = ("normal", "position", "scatter", "light")
+    gbuffer = load_gbuffer(encode(normal=N, position=P, **zero), needs)
+    assert not gbuffer.warnings
+    assert not gbuffer.attributes["scatter"].any()
+
+
 def test_positions_in_world_space():
     view = Camera.look_at((8, 2, 5), (0, 1, 0), (0, 1, 0), 50, W, H)
     inverse = np.linalg.inv(view.matrix)

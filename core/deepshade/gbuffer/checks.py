@@ -32,6 +32,8 @@ _GOOD = _ALIKE  # misfit that no other reading can be so much better than
 _UNLIKELY = 0.6  # misfit of surfaces and normals that have little to do with each other
 _LENGTH = 0.1  # by how much a normal may be too short or too long, in the median
 _MOST, _FEW = 0.9, 0.1
+# Zero where there is no surface; elsewhere black, at rest or in focus is zero too.
+_SURFACE = {*DEPTHS, "position", "position_world", "normal", "normal_world"}
 _SEEN = 0.7  # share of normals that face the camera where they are interpolated, or bumpy
 
 
@@ -155,9 +157,10 @@ class _Examination:
             for name, shown in self.shown.items()
             if name != "alpha"
         }
-        if not share or not self.pairs.count:
+        telling = _SURFACE & share.keys()
+        if not telling or not self.pairs.count:
             return False
-        fullest = max(share, key=lambda name: share[name])
+        fullest = max(sorted(telling), key=lambda name: share[name])
         if share[fullest] == 0:
             self.warn("nothing is shown: every pixel is background")
             return False
@@ -408,6 +411,8 @@ def _shown(name: str, stored: Array) -> Mask:
         return np.asarray(finite & (stored[0] != 0) & (np.abs(stored[0]) < FAR))
     if name == "position":
         return np.asarray(finite & (stored[2] != 0) & (np.abs(stored[2]) < FAR))
+    if name not in _SURFACE:
+        return np.asarray(finite)
     return np.asarray(finite & (stored != 0).any(0))
 
 
