@@ -81,6 +81,23 @@ def shade(
         typer.Option("--map", metavar="ATTR=CHANNEL", help="Where an attribute is; repeatable."),
     ] = None,
     profile: Annotated[str | None, typer.Option(help="Renderer whose names to expect.")] = None,
+    axes: Annotated[
+        list[str] | None,
+        typer.Option(help="Stored axes, as position:x,-y,-z or opencv; repeatable."),
+    ] = None,
+    normals: Annotated[
+        Literal["signed", "encoded", "scaled"] | None, typer.Option(help="How normals are stored.")
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="What is stored as depth: planar, distance, inverse, …")
+    ] = None,
+    near: Annotated[float | None, typer.Option(help="Depth of the near plane.")] = None,
+    far: Annotated[float | None, typer.Option(help="Depth of the far plane.")] = None,
+    derive: Annotated[
+        list[str] | None, typer.Option(help="An attribute to derive, though it is there.")
+    ] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Warnings are errors.")] = False,
+    trust: Annotated[bool, typer.Option("--trust", help="Skip checks of the input.")] = False,
     bundle: Annotated[str | None, typer.Option(help="Which of the effect's bundles.")] = None,
     quality: Annotated[
         Literal["fast", "balanced", "best"] | None,
@@ -163,6 +180,14 @@ def shade(
         world_to_camera=world_to_camera,
         profile=profile,
         mapping=parse_mapping(map_ or []),
+        axes=axes,
+        normals=normals,
+        depth=depth,
+        near=near,
+        far=far,
+        derive=derive,
+        strict=strict or None,
+        trust=trust or None,
         bundle=bundle,
         quality=quality,
         max_error=max_error,

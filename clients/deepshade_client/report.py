@@ -186,6 +186,7 @@ def as_options(text: str) -> str:
     def option(parameter: re.Match[str]) -> str:
         return f"--{parameter[1].replace('_', '-')}{' ' if parameter[2] else ''}"
 
+    text = re.sub(r"\?(strict|trust)=1", r"--\1", text)  # which take no value there
     return re.sub(r"\?([a-z_]+)=(?=([\w<.])?)", option, text)
 
 

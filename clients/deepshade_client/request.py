@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import email.utils
+import re
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -47,6 +48,11 @@ class Options:
     attribute, `half` asks for 16-bit pixels. `environment` names the map that lights the scene,
     `rotate` turns it, in degrees, and `up` is the world's up axis.
 
+    How the values are stored, where the service doesn't find it out: `axes` as in
+    "position:x,-y,-z" or "opencv", `normals`, the kind of `depth` with the `near` and `far` plane
+    where it needs them, and what to `derive` though it is there. `strict` makes warnings errors,
+    `trust` skips the checks.
+
     What the answer holds: with `append` the picture's own channels too, and the answer as a layer;
     `layer` names that ("AO"); with `multiply` the picture's beauty times the answer.
 
@@ -66,6 +72,14 @@ class Options:
     world_to_camera: ArrayLike | str | None = None
     profile: str | None = None
     mapping: Mapping[str, str] | None = None
+    axes: Sequence[str] | None = None
+    normals: Literal["signed", "encoded", "scaled"] | None = None
+    depth: str | None = None
+    near: float | None = None
+    far: float | None = None
+    derive: Sequence[str] | None = None
+    strict: bool | None = None
+    trust: bool | None = None
     bundle: str | None = None
     quality: str | None = None
     max_error: float | None = None
@@ -84,8 +98,10 @@ class Options:
         matrix = self.world_to_camera
         if matrix is not None and not isinstance(matrix, str):
             matrix = ",".join(f"{number:.17g}" for number in np.asarray(matrix, float).flat)
-        plain = asdict(replace(self, mapping=None, world_to_camera=matrix))
+        plain = asdict(replace(self, mapping=None, axes=None, derive=None, world_to_camera=matrix))
         mapped = [("map", f"{name}={where}") for name, where in (self.mapping or {}).items()]
+        mapped += [("axes", axes) for axes in self.axes or ()]
+        mapped += [("derive", name) for name in self.derive or ()]
         return [(name, _text(value)) for name, value in plain.items() if value is not None] + mapped
 
 
@@ -102,8 +118,11 @@ def shade_request(
     names = effects if isinstance(effects, str) else ",".join(effects)
     request = {"method": "POST", "url": f"shade/{quote(names, safe=',')}", "params": query}
     if isinstance(picture, (str, bytes, Path)):
-        _, data = _named(picture)
-        return request | {"content": data, "headers": {"Content-Type": EXR}}
+        name, data = _named(picture)
+        headers = {"Content-Type": EXR}
+        if re.fullmatch(r"[\w. #%+-]+", name, re.ASCII):  # what any header may hold
+            headers["Content-Disposition"] = f'attachment; filename="{name}"'
+        return request | {"content": data, "headers": headers}
     named = picture.items() if isinstance(picture, Mapping) else [("image", s) for s in picture]
     files = [(field, (*_named(source), EXR)) for field, source in named]
     return request | {"files": files}

@@ -114,15 +114,26 @@ class Camera:
         `width` and `height` are those of the data window; the whole frame by default.
         """
         width, height = width or self.width, height or self.height
-        scale = 1.0 / self.pixels_per_unit
-        x = (np.arange(width) + (self.x0 + 0.5 - 0.5 * self.width)) * scale + self.center[0]
-        y = 0.5 * self.height - self.y0 - 0.5 - np.arange(height)
-        y = y * (scale / self.pixel_aspect) + self.center[1]
         out = np.empty((3, height, width), np.float32)
-        out[0] = x
-        out[1] = y[:, None]
+        out[0], out[1] = self._slopes(np.arange(width), np.arange(height)[:, None])
         out[2] = -1.0
         return out
+
+    def rays_at(
+        self, columns: NDArray[np.integer[Any]], rows: NDArray[np.integer[Any]]
+    ) -> NDArray[np.float64]:
+        """The same through some of the stored pixels, by their numbers (...): (3, ...)."""
+        x, y = self._slopes(columns, rows)
+        return np.stack([x, y, np.full(x.shape, -1.0)])
+
+    def _slopes(
+        self, columns: NDArray[np.integer[Any]], rows: NDArray[np.integer[Any]]
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """x / -z and y / -z of the stored pixels' centres."""
+        scale = 1.0 / self.pixels_per_unit
+        x = (columns + (self.x0 + 0.5 - 0.5 * self.width)) * scale + self.center[0]
+        y = 0.5 * self.height - self.y0 - 0.5 - rows
+        return x, y * (scale / self.pixel_aspect) + self.center[1]
 
     def position_from_depth(self, depth: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """P_s, (3, H, W), from planar depth (H, W) in scene units; non-finite depth stays so."""
@@ -191,6 +202,8 @@ def matrix_from_header(attributes: Mapping[str, Any]) -> NDArray[np.float64] | N
         matrix = np.asarray(value, np.float64).reshape(4, 4).T
     except (TypeError, ValueError):
         raise CameraError("the header's worldToCamera is no 4 x 4 matrix") from None
+    if matrix[3, :3].any() and not matrix[:3, 3].any():
+        matrix = matrix.T  # pbrt writes it as it multiplies columns
     return _checked_matrix(matrix)
 
 

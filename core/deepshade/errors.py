@@ -87,6 +87,18 @@ class CameraError(DeepshadeError):
     """A derivation needs a field of view or camera matrix that is absent or unusable."""
 
 
+class ContradictionError(DeepshadeError):
+    """Attributes of a G-buffer can't all be true: `seen` says what, `fits` which reading would.
+
+    `fix` names the options that ask for it.
+    """
+
+    def __init__(self, detail: str, *, seen: str = "", fits: Sequence[str] = (), fix: str) -> None:
+        super().__init__(detail, fix=f"{fix}; or --trust, if it is meant so")
+        self.seen = seen or detail
+        self.fits = tuple(fits)
+
+
 class BundleError(DeepshadeError):
     """A model bundle is incomplete, malformed, or its files don't match their hashes."""
 

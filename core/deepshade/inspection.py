@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from deepshade.exr import Limits
+    from deepshade.gbuffer.conventions import Conventions
     from deepshade.gbuffer.plan import Plan
 
 SCENE_SUFFIXES = {".obj", ".ply", ".gltf", ".glb", ".stl", ".off", ".xml"}
@@ -34,6 +35,18 @@ def inspect(
         str | None, typer.Option(help="The renderer whose names and conventions to use.")
     ] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    axes: Annotated[
+        list[str] | None,
+        typer.Option(help="Stored axes, as position:x,-y,-z or opencv; repeatable."),
+    ] = None,
+    normals: Annotated[
+        str | None, typer.Option(help="How normals are stored: signed, encoded or scaled.")
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="What is stored as depth: planar, distance, inverse, …")
+    ] = None,
+    near: Annotated[float | None, typer.Option(help="Depth of the near plane.")] = None,
+    far: Annotated[float | None, typer.Option(help="Depth of the far plane.")] = None,
     world_to_camera: Annotated[
         str | None,
         typer.Option(help="The camera's matrix: 16 numbers, row by row, for column vectors."),
@@ -53,6 +66,7 @@ def inspect(
     """
     from deepshade.camera import parse_matrix
     from deepshade.gbuffer.channels import parse_mapping
+    from deepshade.gbuffer.conventions import parse_conventions
 
     if any(file.suffix.lower() in SCENE_SUFFIXES for file in files):
         # By name, for the core imports no other part; without the extra, run() says so.
@@ -60,7 +74,12 @@ def inspect(
         return
     matrix = parse_matrix(world_to_camera) if world_to_camera else None
     report = inspect_files(
-        files, mapping=parse_mapping(map_ or ()), profile=profile, fov=fov, matrix=matrix
+        files,
+        mapping=parse_mapping(map_ or ()),
+        profile=profile,
+        fov=fov,
+        matrix=matrix,
+        conventions=parse_conventions(axes or (), normals, depth, near, far),
     )
     if json:
         import json as json_module
@@ -80,12 +99,14 @@ def inspect_files(
     fov: float | None = None,
     matrix: NDArray[np.float64] | None = None,
     limits: Limits | None = None,
+    conventions: Conventions | None = None,
 ) -> dict[str, Any]:
     """The report on files of one view, as plain JSON values.
 
     Keys: files (parts, channels, windows), profile, camera, mapped, ambiguous, effects (for each:
-    ready, bundles, have, derived, missing) and statistics. `matrix` is worldToCamera (4, 4), for
-    column vectors, in place of the header's. An effect is ready when a bundle of it is installed
+    ready, bundles, have, derived, missing), statistics, and checks (derived, warnings, and the
+    contradiction with its fix, if there is one). `matrix` is worldToCamera (4, 4), for column
+    vectors, in place of the header's. An effect is ready when a bundle of it is installed
     whose inputs are there or can be derived. Raises what `load_gbuffer` raises for files
     that can't be read, but not for missing or ambiguous attributes: those are the report.
     """
@@ -117,6 +138,16 @@ def inspect_files(
             for name, effect in EFFECTS.items()
         },
         "statistics": _statistics(plan, bodies, limits),
+        "checks": _checks(
+            plan,
+            list(zip([path.name for path in paths], bodies, strict=True)),
+            profile=profile,
+            mapping=mapping,
+            fov=fov,
+            limits=limits,
+            headers=headers,
+            conventions=conventions,
+        ),
     }
 
 
@@ -190,6 +221,24 @@ def _state(plan: Plan, inputs: Sequence[str]) -> dict[str, Any]:
     return {"have": have, "derived": derived, "missing": missing}
 
 
+def _checks(plan: Plan, sources: Sequence[tuple[str, bytes]], **how: Any) -> dict[str, Any]:
+    """What the geometry says of itself, as when it is shaded."""
+    from deepshade.errors import ContradictionError, DeepshadeError
+    from deepshade.gbuffer import load_gbuffer
+
+    needs = [name for name in ("normal", "position", "depth") if plan.steps(name) is not None]
+    found: dict[str, Any] = {"derived": {}, "warnings": [], "contradiction": None}
+    try:
+        if needs:
+            gbuffer = load_gbuffer(sources, needs, **how)
+            found |= {"derived": gbuffer.derived, "warnings": list(gbuffer.warnings)}
+    except ContradictionError as error:
+        found["contradiction"] = {"detail": str(error), "fix": error.fix}
+    except DeepshadeError as error:
+        found["warnings"] = [str(error)]
+    return found
+
+
 def _statistics(plan: Plan, bodies: Sequence[bytes], limits: Limits) -> dict[str, Any]:
     """Of every mapped quantity: pixels, non-finite ones, the finite values' range; lengths."""
     import numpy as np
@@ -251,6 +300,15 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
     for name, candidates in report["ambiguous"].items():
         table.add_row(name, f"[yellow]ambiguous:[/yellow] {_safe(', '.join(candidates))}")
     console.print(table)
+
+    checks = report["checks"]
+    for name, how in checks["derived"].items():
+        console.print(f"{name}: {_safe(how)}")
+    for warning in checks["warnings"]:
+        console.print(f"[yellow]warning:[/yellow] {_safe(warning)}")
+    if checks["contradiction"]:
+        console.print(f"[red]contradiction:[/red] {_safe(checks['contradiction']['detail'])}")
+        console.print(f"  fix: {_safe(checks['contradiction']['fix'])}")
 
     table = Table("effect", "state", "lacks")
     for name, effect in report["effects"].items():

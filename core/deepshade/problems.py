@@ -10,6 +10,7 @@ from deepshade.errors import (
     BundleError,
     CameraError,
     ConfigError,
+    ContradictionError,
     DamagedImageError,
     DeepshadeError,
     ImageError,
@@ -27,11 +28,15 @@ _KINDS: tuple[tuple[type[DeepshadeError], int, str], ...] = (
     (MissingAttributeError, 422, "missing-attribute"),
     (AmbiguousChannelError, 422, "ambiguous-channel"),
     (CameraError, 422, "no-camera"),
+    (ContradictionError, 422, "contradiction"),
     (ConfigError, 422, "bad-parameter"),
     (BundleError, 500, "bad-bundle"),
     (DeepshadeError, 422, "unusable-input"),
 )
-_FACTS = ("missing", "found", "near", "attribute", "candidates", "limit", "value", "maximum")
+_FACTS = (
+    *("missing", "found", "near", "attribute", "candidates", "seen", "fits"),
+    *("limit", "value", "maximum"),
+)
 MAX_ENTRIES = 200  # entries of a list; a file may have thousands of channels
 
 

@@ -12,7 +12,7 @@ from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS, SETTINGS, Effect, Setting
 from deepshade.errors import MissingAttributeError
 from deepshade.gbuffer import GBuffer, load_gbuffers
-from deepshade_service.parameters import LENS, ShadeParameters
+from deepshade_service.parameters import LENS, ShadeParameters, Share
 from deepshade_service.problems import Problem
 from deepshade_service.uploads import Upload
 
@@ -60,7 +60,9 @@ def decode(
         fov=asked.fov,
         limits=limits,
         headers=headers,
-        anew=("focal",) if new_lens else (),
+        anew=(*(name.value for name in asked.derive), *(("focal",) if new_lens else ())),
+        conventions=asked.conventions,
+        radius=None if isinstance(asked.radius, Share) else asked.radius,
     )
     try:
         for bundle, gbuffer in zip(bundles, gbuffers, strict=True):

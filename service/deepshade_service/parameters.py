@@ -20,12 +20,21 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
+from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import parse_matrix
 from deepshade.effects import EFFECTS, SETTINGS, Effect
 from deepshade.effects.settings import MAX_LENGTH, MIN_LENGTH
 from deepshade.errors import CameraError, ConfigError
 from deepshade.exr import COMPRESSIONS
 from deepshade.gbuffer.channels import parse_mapping
+from deepshade.gbuffer.conventions import (
+    ENCODINGS,
+    Checks,
+    Conventions,
+    parse_axes,
+    parse_conventions,
+)
+from deepshade.gbuffer.depths import KINDS, MEANINGS
 from deepshade.gbuffer.profiles import PROFILES
 from deepshade_service.problems import Problem
 
@@ -43,6 +52,9 @@ _RADIUS_SCHEMA = {
 }
 
 Compression = StrEnum("Compression", {name: name for name in COMPRESSIONS})  # type: ignore[misc]
+Normals = StrEnum("Normals", {name: name for name in ENCODINGS})  # type: ignore[misc]
+Depth = StrEnum("Depth", {name: name for name in KINDS})  # type: ignore[misc]
+Derivable = StrEnum("Derivable", {name: name for name in ATTRIBUTES})  # type: ignore[misc]
 Profile = StrEnum("Profile", {name: name for name in PROFILES})  # type: ignore[misc]
 
 
@@ -113,6 +125,48 @@ class ShadeParameters(BaseModel):
         list[str],
         Field(description="`attribute=channel or layer`, repeatable: where an attribute is."),
     ] = []
+    axes: Annotated[
+        list[str],
+        Field(
+            description="`vector:axes`, repeatable: our x, y and z (right, up, towards the viewer)"
+            " from the stored ones, as `position:x,-y,-z`, or `opengl`, `opencv`, `directx`,"
+            " `unity` or `unreal`; without a vector, of position and normal."
+            " Else they are found out."
+        ),
+    ] = []
+    normals: Annotated[
+        Normals | None,
+        Field(
+            description="How normals are stored: `signed`, `encoded` (n / 2 + 1 / 2) or `scaled`"
+            " (of any length). Else it is found out."
+        ),
+    ] = None
+    depth: Annotated[
+        Depth | None,
+        Field(
+            description="What is stored as depth: "
+            + "; ".join(f"`{kind}`, {meaning}" for kind, meaning in MEANINGS.items())
+            + ". Else it is found out."
+        ),
+    ] = None
+    near: Annotated[
+        float | None,
+        Field(gt=0, allow_inf_nan=False, description="Depth of the near plane, scene units."),
+    ] = None
+    far: Annotated[
+        float | None,
+        Field(gt=0, allow_inf_nan=False, description="Depth of the far plane, scene units."),
+    ] = None
+    derive: Annotated[
+        list[Derivable],
+        Field(description="Attributes to derive from others, repeatable, though they are there."),
+    ] = []
+    strict: Annotated[
+        bool, Field(description="What would be a warning about the G-buffer is an error.")
+    ] = False
+    trust: Annotated[
+        bool, Field(description="Believe the G-buffer; it isn't checked against itself.")
+    ] = False
     bundle: Annotated[
         str | None,
         Field(description="Which of the effect's bundles; else `balanced`, else the least error."),
@@ -198,6 +252,24 @@ class ShadeParameters(BaseModel):
             raise ValueError(str(error)) from None  # which names the parameter
         return entries
 
+    @field_validator("axes")
+    @classmethod
+    def _check_axes(cls, entries: list[str]) -> list[str]:
+        try:
+            parse_axes(entries)
+        except ConfigError as error:
+            raise ValueError(f"{error}; {error.fix}" if error.fix else str(error)) from None
+        return entries
+
+    @property
+    def conventions(self) -> Conventions:
+        """How values are stored, as far as it is said, and how they are checked.
+
+        Raises ConfigError for a kind of depth without its planes.
+        """
+        checks: Checks = "trust" if self.trust else "strict" if self.strict else "usual"
+        return parse_conventions(self.axes, self.normals, self.depth, self.near, self.far, checks)
+
     @field_validator("radius", mode="wrap")
     @classmethod
     def _read_share(cls, value: object, number: ValidatorFunctionWrapHandler) -> object:
@@ -227,7 +299,8 @@ class ShadeParameters(BaseModel):
         return parse_mapping(self.map)
 
     def check(self, effects: Sequence[Effect]) -> None:
-        """Raises Problem 422 for a setting that none of the effects has."""
+        """Raises Problem 422 for a setting that none of the effects has, or settings that don't go
+        together, and ConfigError for a kind of depth without its planes."""
         for name, setting in SETTINGS.items():
             if getattr(self, name) is None or any(effect.takes(setting) for effect in effects):
                 continue
@@ -240,6 +313,14 @@ class ShadeParameters(BaseModel):
                 fix=f"leave out ?{name}=; it is a setting of {', '.join(having)}",
                 effects=having,
             )
+        if self.strict and self.trust:
+            raise Problem(
+                422,
+                "bad-parameter",
+                "strict checks everything and trust nothing",
+                fix="leave out ?strict= or ?trust=",
+            )
+        self.conventions  # noqa: B018 (raises)
         if self.format == "png" and len(effects) > 1:
             raise Problem(
                 422,

@@ -87,7 +87,7 @@ def explain(
         "dssim": bundle.dssim,
         **_settings(gbuffer, bundle.effect, plan),
         "derived": _derived(gbuffer, plan),
-        "warnings": [plan.radius.warning] if plan.radius.warning else [],
+        "warnings": [*gbuffer.warnings, *filter(None, [plan.radius.warning])],
         "pixels": {
             "width": width,
             "height": height,

@@ -28,6 +28,7 @@ _OPTIONS = {
     "files": "--max-files",
     "memory_bytes": "--memory",
 }
+_SWITCHES = ("strict", "trust")  # which commands take without a value
 
 
 class Problem(Exception):
@@ -72,7 +73,8 @@ def _as_query(text: str, parameters: Collection[str]) -> str:
 
     def query(option: re.Match[str]) -> str:
         name = option[1].replace("-", "_")
-        return f"?{name}=" if name in parameters else option[0]
+        value = "1" if name in _SWITCHES else ""
+        return f"?{name}={value}" if name in parameters else option[0]
 
     return re.sub(r"--([a-z][a-z-]*)(?: (?=[\w<]))?", query, text)
 

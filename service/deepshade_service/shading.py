@@ -183,6 +183,9 @@ def run(
         plan = plan_shading(gbuffer, bundle, asked, job.need.max_pixels)
         if job.prepared is not None:
             plan = lit(plan, job.prepared, gbuffer, bundle, asked)
+        if asked.strict and plan.radius.warning:
+            fix = "leave out ?strict=1 to have it shaded"
+            raise Problem(422, "contradiction", plan.radius.warning, fix=fix)
         made = explain(gbuffer, headers, job.selection, asked, plan, held)
         facts = facts_of(gbuffer, plan, made)
     shade = np.empty((0, 0, 0), np.float32)

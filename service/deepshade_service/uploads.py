@@ -8,7 +8,7 @@ the sum a body counts twice while it arrives, because joining its pieces needs t
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import AsyncIterator, Awaitable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -74,7 +74,7 @@ class Uploads:
                     body.chunks(request), parameters.get(b"boundary"), self._settings.files
                 )
             else:
-                reading = _read_raw(body.chunks(request))
+                reading = _read_raw(body.chunks(request), request.headers)
             files = await self._in_time(reading)
             body.joined()
             yield files
@@ -197,8 +197,11 @@ class _Form:
         self.complete = True
 
 
-async def _read_raw(chunks: AsyncIterator[bytes]) -> list[Upload]:
-    return [Upload("", "", await _join([chunk async for chunk in chunks]))]
+async def _read_raw(chunks: AsyncIterator[bytes], headers: Mapping[str, str]) -> list[Upload]:
+    """One file, which may be named as a part of a form is."""
+    _, options = parse_options_header(headers.get("content-disposition", ""))
+    name = options.get(b"filename", b"").decode("utf-8", "replace")
+    return [Upload("", name, await _join([chunk async for chunk in chunks]))]
 
 
 async def _read_form(

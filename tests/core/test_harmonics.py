@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import sph_harm_y
 
-from deepshade import symmetry
 from deepshade.environments import Environment, directions, solid_angles, world_to_map
-from deepshade.environments.harmonics import COUNT, harmonics, projected, turning
+from deepshade.environments.harmonics import COUNT, harmonics, projected
 
 
 def test_they_are_scipys_without_its_phase() -> None:
@@ -42,23 +41,3 @@ def test_white_has_the_first_alone() -> None:
     assert found[:, 0] == pytest.approx(np.sqrt(4 * np.pi))
     assert np.abs(found[:, 1:]).max() < 0.05
     assert solid_angles(16, 32).sum() * 32 == pytest.approx(4 * np.pi)
-
-
-def test_coefficients_turn_with_what_they_describe() -> None:
-    environment = Environment("", np.random.default_rng(2).random((3, 32, 64)).astype(np.float32))
-    turn = world_to_map(25.0, "z") @ world_to_map(110.0)
-    assert turning(turn) @ turning(turn).T == pytest.approx(np.eye(COUNT), abs=1e-9)
-    # `turn` leads to the map: what comes back from it is turned by its inverse.
-    turned = projected(environment) @ turning(turn.T).T
-    assert turned == pytest.approx(projected(environment, turn), abs=1e-9)
-
-
-@pytest.mark.parametrize("number", symmetry.ALL)
-def test_they_follow_the_symmetries_of_pictures(number: int) -> None:
-    """A picture's turns and mirrors of camera-space vectors, as a matrix: unit vectors turned."""
-    matrix = symmetry.apply(np.eye(3)[..., None, None], "normal", number)[..., 0, 0].T
-    vectors = np.random.default_rng(1).normal(size=(3, 4, 4))
-    vectors /= np.linalg.norm(vectors, axis=0)
-    expected = np.stack(harmonics(*symmetry.apply(vectors, "normal", number)))
-    planes = symmetry.apply(np.stack(harmonics(*vectors)), None, number)
-    assert np.tensordot(turning(matrix), planes, axes=1) == pytest.approx(expected, abs=1e-9)

@@ -162,10 +162,14 @@ def picture(height: int, width: int, seed: int = 0) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     y, x = (np.mgrid[0:height, 0:width] + 0.5) / max(height, width)
     bumps = rng.uniform(0, 2 * np.pi, 4)
-    depth = 3 + y + 0.2 * np.sin(30 * x + bumps[0]) * np.cos(25 * y + bumps[1])
-    normal = np.stack([np.sin(9 * x + bumps[2]), np.cos(7 * y + bumps[3]), np.full_like(x, 1.5)])
-    normal /= np.linalg.norm(normal, axis=0)
+    a, b = 7 * x + bumps[0], 5 * y + bumps[1]
+    depth = 3 + y + 0.2 * np.sin(a) * np.cos(b)
+    right, down = 1.4 * np.cos(a) * np.cos(b), 1 - np.sin(a) * np.sin(b)  # the depth's changes
     position = np.stack([(x - 0.5) * depth, (0.5 - y) * depth, -depth])
+    across = np.stack([depth + (x - 0.5) * right, (0.5 - y) * right, -right])
+    along = np.stack([(x - 0.5) * down, (0.5 - y) * down - depth, -down])
+    normal = np.cross(along, across, axis=0)
+    normal /= np.linalg.norm(normal, axis=0)
     planes = dict(zip("XYZ", range(3), strict=True))
     return {
         f"{name}.{axis}": array[index].astype(np.float32)

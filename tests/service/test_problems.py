@@ -132,7 +132,9 @@ def test_fixes_name_query_parameters_and_following_them_works(client, make_exr):
     assert shade(client, body, "?fov=50").status_code == 200
     document = problem(shade(client, make_exr({"A": plane})), 422, "missing-attribute")
     assert "depth with the field of view (?fov=)" in document["fix"]
-    body = make_exr({f"{a}.normal.{c}": plane for a in "AB" for c in "XYZ"} | {"Z": plane})
+    body = make_exr(
+        {f"{a}.normal.{c}": plane * (c == "Z") for a in "AB" for c in "XYZ"} | {"Z": plane}
+    )
     document = problem(shade(client, body, "?fov=50"), 422, "ambiguous-channel")
     query = document["fix"].partition(": ")[2]
     assert shade(client, body, f"{query}&fov=50").status_code == 200

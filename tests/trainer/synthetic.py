@@ -25,7 +25,7 @@ SIZE = 64
 RADIUS = 0.5
 # What a fold network of a few thousand parameters is, instead of a preset's million.
 TRUNK: dict[str, Any] = {"widths": (8, 12), "steps": (2,), "down": (1, 1), "up": (1,)}
-OPENINGS = TRUNK | {"features": 8, "directions": 12}
+OPENINGS = {"kind": "openings", "trunk": TRUNK, "hidden": 4}
 SMALL = TRUNK | {"rings": (1,), "fine_rings": (1, 2), "detail": ()}
 
 
@@ -109,7 +109,8 @@ def write_data(folder: Path, effect: str, count: int = 8) -> Path:
 
 def small(effect: str, name: str) -> Recipe:
     """A preset, its network small if it is ours, for one step of two views."""
-    recipe = preset(name, effect).changed(steps=1, batch=2, val_fraction=0.2, precision="fp32")
+    change = {"steps": 1, "batch": 2, "val_fraction": 0.2, "precision": "fp32", "init_from": ""}
+    recipe = preset(name, effect).changed(**change)
     shape = {"fold": SMALL, "carrier": TRUNK, "openings": OPENINGS}.get(recipe.network.kind, {})
     return recipe.changed(network=shape)
 

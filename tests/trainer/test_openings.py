@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,11 @@ from deepshade.bundles import Bundle, bundle_root
 from deepshade.effects import EFFECTS
 from deepshade.environments import Environment, Prepared, directions, solid_angles
 from deepshade.environments.lamps import DIRECTIONS
+from deepshade.errors import ConfigError
+from deepshade.gbuffer import load_gbuffer
 from deepshade.tensors import tensor, up
 from deepshade_trainer.lit import Lit
-from deepshade_trainer.networks import Shader, build
+from deepshade_trainer.networks import Shader, build, from_bundle, network_config, slices
 from deepshade_trainer.networks.openings import Openings, OpeningsConfig
 
 from .synthetic import OPENINGS, arrays, write_data
@@ -26,10 +27,12 @@ NAMES = Openings.environment
 SHIPPED = sorted(path.parent for path in bundle_root().glob("do/*/config.json"))
 
 
-def network(seed: int = 0) -> Openings:
+def network(seed: int = 0, learnt: float = 0.3) -> Openings:
+    """With random weights; without `learnt` it only calculates."""
     torch.manual_seed(seed)
-    made = build(OpeningsConfig(**OPENINGS))
+    made = build(network_config(OPENINGS))
     assert isinstance(made, Openings)
+    torch.nn.init.normal_(made.block.weight, std=learnt)
     return made.eval()
 
 
@@ -49,14 +52,70 @@ def answer(made: Openings, light: Prepared, degrees: float = 0.0) -> np.ndarray:
         return made(gbuffer(), *map(torch.from_numpy, given.values())).numpy()
 
 
-def test_a_white_map_gives_ambient_occlusion_whatever_the_weights() -> None:
-    made = network()
-    light = prepared(np.full((3, 16, 32), 2))
+def test_frames_are_rotations_that_take_the_axis_to_the_eye() -> None:
+    eye = slices.toward_eye(gbuffer()[:, 6:, 20:])
+    axis = torch.tensor([0.0, 0.0, 1.0])[None, :, None, None].expand_as(eye)
+    vectors = torch.randn(1, 3, 5, *eye.shape[2:], generator=torch.Generator().manual_seed(1))
+    turned = slices.out_of_frame(eye[:, :, None], vectors)
+    assert torch.allclose(turned.norm(dim=1), vectors.norm(dim=1), atol=1e-5)
+    assert torch.allclose(slices.out_of_frame(eye[:, :, None], axis[:, :, None])[:, :, 0], eye)
+    back = slices.into_frame(eye, turned[:, :, 2])
+    assert torch.allclose(back, vectors[:, :, 2], atol=1e-5)
+
+
+def test_light_through_lobes_is_a_polynomial_of_the_place() -> None:
+    """Of a lamp as wide as a sector, seen anywhere in a picture of 60 degrees."""
+    lamp = np.array([0.3, 0.5, 0.6])
+    light = np.maximum(DIRECTIONS @ (lamp / np.linalg.norm(lamp)), 0) ** 12
+    terms = torch.from_numpy(slices.lobes(DIRECTIONS, 32.0) @ light)
+    for x, y in ((0.0, 0.0), (0.4, -0.2), (-0.3, 0.4)):
+        eye = torch.tensor([x, y, (1 - x * x - y * y) ** 0.5])[None, :, None, None]
+        found = (slices.place(eye)[0, :, 0] * terms).sum(0).numpy()
+        toward = torch.from_numpy(slices.sectors()[0].T).float()[None, :, :, None, None]
+        axes = slices.out_of_frame(eye[:, :, None], toward)[0, :, :, 0, 0].numpy()
+        shares = np.maximum(axes.T @ DIRECTIONS.T, 0) ** 32
+        expected = shares @ light / shares.sum(1)
+        assert found == pytest.approx(expected, abs=0.08)
+        assert np.abs(found - expected).mean() < 0.02
+
+
+def test_a_floor_with_nothing_near_is_lit_as_if_alone() -> None:
+    seen = room(64, height=0.0)
+    given = tensor(EFFECTS["do"], seen, EFFECTS["do"].inputs, 1.0, per_channel=False)
+    irradiance, through = torch.rand(1, 3, 64, 64), torch.rand(1, 3, slices.TERMS, slices.SECTORS)
     with torch.inference_mode():
-        occlusion = made.trunk(gbuffer(), 3)[0]
-    seen = answer(made, light)
-    occlusion = torch.where(gbuffer()[:, 8:] < 0, occlusion, 1)  # elsewhere is nothing
-    assert seen == pytest.approx(2 * occlusion.expand(-1, 3, -1, -1).numpy(), abs=1e-5)
+        found = network(learnt=0).lit(torch.from_numpy(given), irradiance, through)
+    assert torch.allclose(found, irradiance, atol=0.01)
+
+
+def test_what_a_wall_blocks_is_what_rays_say() -> None:
+    """The sectors of a floor's cells beside a wall so thick that none sees past it."""
+    side, high = 96, 0.5
+    seen = room(side, height=high, thick=0.6)
+    given = tensor(EFFECTS["do"], seen, EFFECTS["do"].inputs, 1.0, per_channel=False)
+    folded = torch.nn.functional.pixel_unshuffle(torch.from_numpy(given)[:, 3:9], slices.CELL)
+    folded = folded.reshape(1, 6, 16, *folded.shape[2:])
+    at = folded[:, :, slices.TAKEN * (slices.CELL + 1)]
+    at = torch.cat([at, torch.ones_like(at[:, :1])], 1)
+    blocked = torch.stack([part[0, : slices.HEIGHTS] for part in slices.slices(folded, at)])
+    row, column = side // 8, side * 3 // 4 // 4  # of a cell to the wall's right
+    x = float(at[0, 3, row, column])
+    for azimuth in range(slices.AZIMUTHS):
+        for sector in range(slices.HEIGHTS):
+            cosines = 1 - (sector + (np.arange(9) + 0.5) / 9) * 2 / slices.HEIGHTS
+            angles = (azimuth + (np.arange(9) - 4) / 9) * 2 * np.pi / slices.AZIMUTHS
+            u, a = np.meshgrid(cosines, angles)
+            # the eye is so far above that its ray is the axis
+            toward = np.stack([np.sqrt(1 - u * u) * np.cos(a), np.sqrt(1 - u * u) * np.sin(a), u])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                reach = np.where(toward[0] < 0, (0.3 - x) / toward[0], np.inf)
+            hit = (reach * toward[2] < high) & (reach < 1) & (toward[2] > 0)
+            found = float(blocked[azimuth, sector, row, column])
+            if (u > 0.1).all():
+                assert found == pytest.approx(hit.mean(), abs=0.45)
+    total = blocked[:, : slices.HEIGHTS // 2, row, column].sum(1)
+    assert total[slices.AZIMUTHS // 2] > 0.8
+    assert total[0] < 0.05
 
 
 def test_the_answer_is_linear_in_the_map() -> None:
@@ -87,7 +146,9 @@ def test_it_is_learnt_as_it_answers() -> None:
     irradiance = blurred(normal, 1).reshape(1, 3, *given.shape[2:])
     mean = torch.from_numpy(environment.mean.astype(np.float32))[:, None, None]
     irradiance[0] = torch.where(given[0, 8] < 0, irradiance[0], mean)
-    through = blurred(made.towards[0, :, 0].numpy(), 32)
+    toward_nodes, fit = slices.nodes()
+    through = blurred(toward_nodes.reshape(-1, 3).T, 32).reshape(1, 3, -1, slices.SECTORS)
+    through = torch.from_numpy(fit).float() @ through
     with torch.inference_mode():
         expected = made.lit(given, irradiance, through).numpy()
     assert answer(made, Prepared.of(environment)) == pytest.approx(expected, abs=0.01)
@@ -96,7 +157,7 @@ def test_it_is_learnt_as_it_answers() -> None:
 def test_several_maps_at_once_are_each_alone() -> None:
     made, given = network(), gbuffer()
     irradiance = torch.rand(1, 6, *given.shape[2:])
-    through = torch.rand(1, 6, 12)
+    through = torch.rand(1, 6, slices.TERMS, slices.SECTORS)
     with torch.inference_mode():
         both = made.lit(given, irradiance, through)
         alone = [made.lit(given, irradiance[:, k], through[:, k]) for k in (slice(3), slice(3, 6))]
@@ -107,7 +168,7 @@ def test_several_maps_at_once_are_each_alone() -> None:
 def samples(tmp_path_factory: pytest.TempPathFactory) -> Lit:
     """Noise, as data."""
     folder = write_data(tmp_path_factory.mktemp("lit"), "do", 2)
-    return Lit([folder], "do", network().towards.numpy(), 4)
+    return Lit([folder], "do")
 
 
 def test_samples_are_relit_as_a_sum_over_their_open_directions(samples: Lit) -> None:
@@ -130,46 +191,24 @@ def test_samples_are_relit_as_a_sum_over_their_open_directions(samples: Lit) -> 
         assert image == pytest.approx(mean, rel=1e-5)
 
 
-def test_the_error_of_what_is_open_is_that_under_each_lamp_alone(samples: Lit) -> None:
-    """The answer to each of some lamps of radiance 1, against open or not."""
-    made = network().train()
-    gbuffer, _, irradiance, through, *probe = samples.batch([1], np.random.default_rng(6))
-    at, open_, towards, shares = (part[0] for part in probe)
-    image, error = made.learnt(gbuffer, irradiance, through, [(at, open_, towards, shares)])
-    assert torch.allclose(image, made.lit(gbuffer, irradiance, through))
-    cells = gbuffer[:, :, at[0] :: 4, at[1] :: 4]
-    normal = cells[0, 3:6] / cells[0, 3:6].norm(dim=0).clamp_min(1e-6)
-    whole = gbuffer[0, 3:6] / gbuffer[0, 3:6].norm(dim=0).clamp_min(1e-6)
-    squares = []
-    for k in range(0, 512, 37):
-        lamp = torch.einsum("d,dhw->hw", towards[k], whole).clamp_min(0)
-        alone = made.lit(gbuffer, lamp[None, None] / 128, shares[None, None, :, k])
-        cosine = torch.einsum("d,dhw->hw", towards[k], normal).clamp_min(0)
-        seen = alone[0, 0, at[0] :: 4, at[1] :: 4] * 128 - open_[k] * cosine
-        squares.append(float((seen * (cells[0, 8] < 0)).square().mean().detach()))
-    assert np.mean(squares) == pytest.approx(float(error.detach()), rel=0.15)
-
-
 @pytest.mark.parametrize("turn", range(8))
 def test_the_light_turns_with_the_picture(samples: Lit, turn: int) -> None:
     """A lamp is then seen where `symmetry.apply` puts a vector that points to it."""
-    lamp = np.zeros((512, 3), np.float32)
-    lamp[100] = 1
-    moved = symmetry.apply(DIRECTIONS[100].reshape(3, 1, 1), "normal", turn)[:, 0, 0]
-    towards = network().towards[0, :, 0].numpy()
-    lobes = np.maximum(moved @ towards, 0) ** 32
-    found = samples._through(lamp, turn)[0]
-    assert found / found.max() == pytest.approx(lobes / lobes.max(), abs=0.05)
-    assert found.argmax() == lobes.argmax()
+    toward = DIRECTIONS[100]
+    moved = symmetry.apply(toward.reshape(3, 1, 1), "normal", turn)[:, 0, 0]
+    lamp, there = (
+        np.maximum(DIRECTIONS @ v, 0)[:, None] ** 8 * np.ones(3) for v in (toward, moved)
+    )
+    found, expected = samples._through(lamp, turn)[0, 0], samples._through(there, 0)[0, 0]
+    assert found == pytest.approx(expected, abs=0.05)
+    assert expected.max() > 0.5
 
 
-def room(side: int) -> dict[str, np.ndarray]:
-    """A floor seen from above, on which a wall 0.6 high and 0.1 thick stands along y."""
+def room(side: int, height: float = 0.6, thick: float = 0.1) -> dict[str, np.ndarray]:
+    """A floor seen from above, on which a wall stands along y."""
     x, y = (np.mgrid[0:side, 0:side][::-1] + 0.5) / side * 2 - 1
-    y = -y
-    wall = np.abs(x) < 0.05
-    height = np.where(wall, 0.6, 0.0)
-    position = np.stack([x, y, height - 4]).astype(np.float32)
+    wall = np.abs(x) < thick / 2
+    position = np.stack([x, -y, np.where(wall, height, 0.0) - 4]).astype(np.float32)
     normal = np.zeros((3, side, side), np.float32)
     normal[2] = 1
     return {"position": position, "normal": normal, "normal_world": normal}
@@ -201,19 +240,38 @@ def test_a_sun_casts_its_shadow_on_the_side_away_from_it(path: Path) -> None:
         assert away < 0.8 * toward_it
 
 
-def test_settings_that_make_no_network_are_refused() -> None:
-    from deepshade.errors import ConfigError
+@pytest.mark.skipif(not SHIPPED, reason="models/do holds no bundle")
+def test_under_a_white_map_it_is_ambient_occlusion() -> None:
+    """That of `ao/balanced`: to .01 over held-out views, to .015 on the sample's surfaces."""
+    seen = load_gbuffer(Path(__file__).parents[2] / "samples" / "room.exr", EFFECTS["do"].inputs)
+    radius, white = 0.4, prepared(np.ones((3, 16, 32)))
+    given = tensor(EFFECTS["do"], seen.attributes, EFFECTS["do"].inputs, radius, per_channel=False)
+    inputs = white.inputs(NAMES, 0.0, "y", lambda: np.eye(3))
+    gbuffer = torch.from_numpy(given)
+    with torch.inference_mode():
+        found = from_bundle(SHIPPED[0])(gbuffer, *map(torch.from_numpy, inputs.values()))
+        occlusion = from_bundle(bundle_root() / "ao" / "balanced")(gbuffer[:, 3:])
+    assert torch.allclose(found[:, 0], found[:, 2], atol=1e-3)
+    difference = (found[:, :1] - occlusion).abs()[gbuffer[:, 8:] < 0]
+    assert float(difference.mean()) < 0.018
+    assert float(occlusion.std()) > 0.1
 
-    for change in ({"features": 0}, {"normal": None}, {"position": 3}, {"fold": 3, "detail": ()}):
+
+def test_settings_that_make_no_network_are_refused() -> None:
+    for change in (
+        {"hidden": 0},
+        {"position": 3},
+        {"trunk": {"fold": 2}},
+        {"trunk": {"bias": "a"}},
+    ):
         with pytest.raises(ConfigError):
-            replace(OpeningsConfig(), **change)
+            network_config(change, OpeningsConfig())
 
 
 def test_a_shader_lights_what_it_pads() -> None:
     shader = Shader(EFFECTS["do"], network()).eval()
     given = gbuffer(height=29, width=37)
-    irradiance, through = torch.rand(1, 3, 29, 37), torch.rand(1, 3, 12)
+    irradiance, through = torch.rand(1, 3, 29, 37), torch.rand(1, 3, slices.TERMS, slices.SECTORS)
     with torch.inference_mode():
-        image, error = shader.lit(shader.padded(given), irradiance, through)
-    assert error == 0
+        image = shader.lit(shader.padded(given), irradiance, through)
     assert image.shape == (1, 3, 32, 40)

@@ -143,7 +143,7 @@ def surrounded(tmp_path_factory: Any) -> tuple[DataSpec, Path, Shard]:
         effects=("do", "full"),
         environments=str(maps),
         skies=2,
-        layers=("do_visibility",),
+        layers=("do_directions",),
     )
     out = tmp_path_factory.mktemp("surrounded")
     return spec, out, make_shard(spec, 0, out, lambda: None)
@@ -158,7 +158,7 @@ def test_each_view_has_its_environment(surrounded: tuple[DataSpec, Path, Shard])
     assert any(name.startswith("sky-") for name in names)
     assert len({record["rotate"] for record in shard.samples}) == 5
     tensors = load_file(out / shard.file)
-    assert tensors["reference_do_visibility"].shape == (5, 16, 32, 32)
+    assert tensors["reference_do_directions"].shape == (5, 64, 32, 32)
     for index, record in enumerate(shard.samples):
         found = read_stored(out, record["environment_sha256"], record["environment"])
         assert found.shape[0] <= MAX_HEIGHT

@@ -10,7 +10,7 @@ import pytest
 
 from deepshade.camera import Camera, rotation_of
 from deepshade.environments import Environment, directions, solid_angles, world_to_map
-from deepshade.environments.harmonics import harmonics, projected
+from deepshade.environments.harmonics import harmonics
 from deepshade.environments.lamps import DIRECTIONS
 from deepshade.errors import ConfigError
 from deepshade_workers.environments import EnvironmentLight
@@ -140,26 +140,6 @@ def test_a_sun_does_not_sparkle(corner: Scene, above: Camera) -> None:
         value, error = rendered(module, corner, light)
         lit = value[0] > np.median(value[0])
         assert (error[0][lit] < 0.2 * value[0][lit]).all()
-
-
-def test_visibility_and_a_smooth_map_give_directional_occlusion(
-    corner: Scene, above: Camera
-) -> None:
-    view = under(smooth(), above, rotation=50.0)
-    layer = layer_of("do_visibility")
-    hits = trace(corner, above, SIDE, SIDE)
-    found, spread = layer.render(corner, view, hits, {}, samples=256, seed=1)
-    assert found.shape == (layer.channels, SIDE, SIDE)
-    occlusion, also = rendered(ao, corner, view, seed=2)
-    assert_within(found[0] * np.sqrt(4 * np.pi), np.hypot(spread[0] * 3.55, also[0]), occlusion[0])
-    light = projected(
-        view.surroundings.environment, world_to_map(50.0) @ rotation_of(above.matrix).T
-    )
-    value, error = rendered(do, corner, view, samples=1024)
-    # Bilinear between 32 columns the map is a little off its harmonics.
-    product = np.einsum("ck,khw->chw", light, found)
-    assert np.abs(product - value).mean() < 0.01 * value.std() + 3 * error.mean()
-    assert value.std() > 10 * np.abs(product - value).mean()
 
 
 def test_open_directions_add_up_to_directional_occlusion(corner: Scene, above: Camera) -> None:

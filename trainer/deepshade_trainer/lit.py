@@ -22,10 +22,11 @@ from deepshade.environments.stored import read_stored
 from deepshade.errors import DataError
 from deepshade_trainer.dataset import Dataset, Sample
 from deepshade_trainer.networks.openings import LEVEL
+from deepshade_trainer.networks.slices import lobes
 
 Float = NDArray[np.float32]
 
-SIDE = 160  # of the part of a sample that is learnt from at a time
+SIDE = 256  # of the part of a sample that is learnt from at a time
 MAPS = 3  # that it is learnt under at a time
 WHITE, LAMPS = 0.15, 0.25  # shares of these that are white, and three lamps
 AMBIENT = 0.05, 0.5  # beside a lamp: share of its irradiance where it falls straight in
@@ -40,16 +41,13 @@ _TURNS = [symmetry.apply(np.eye(3)[:, :, None, None], "normal", k)[..., 0, 0].T 
 class Lit(Dataset):
     """Samples with a layer `reference_<effect>_directions`, relit by lamps in those directions.
 
-    The reference under lamps is exact, without noise: a sum over those that are open. `towards`
-    (1, 3, 1, K) are the directions in camera space in which a network is told of the light, and
-    `cell` the pixels along a side of its cells.
+    The reference under lamps is exact, without noise: a sum over those that are open.
     """
 
-    def __init__(self, folders: Sequence[Path], effect: str, towards: Float, cell: int) -> None:
+    def __init__(self, folders: Sequence[Path], effect: str) -> None:
         super().__init__(folders, effect, per_channel=False)
-        self.cell = cell
         self.layer = f"{self.reference}_directions"
-        self._lobes = [_shares(towards[0, :, 0].T, DIRECTIONS @ turn.T) for turn in _TURNS]
+        self._lobes = [lobes(DIRECTIONS @ turn.T, 2.0**LEVEL) for turn in _TURNS]
         grid = DIRECTIONS @ directions(_ROWS, 2 * _ROWS).reshape(3, -1)
         self._cosines = torch.from_numpy(np.maximum(grid, 0).astype(np.float32))
         for entry in self.entries:
@@ -85,18 +83,8 @@ class Lit(Dataset):
         pair = self._relit(number, sample["normal"], light, part)
         turn = int(rng.integers(len(_TURNS)))
         gbuffer, _ = self._seen(number, sample, turn, rng)
-        at = rng.integers(0, self.cell, 2)
-        packed = symmetry.apply(self._packed(number, part), None, turn)
-        open_ = np.unpackbits(packed[:, at[0] :: self.cell, at[1] :: self.cell], axis=0)
-        return (
-            gbuffer,
-            *(symmetry.apply(image, None, turn) for image in pair),
-            self._through(light, turn),
-            at,
-            open_.astype(np.float32),
-            (DIRECTIONS @ _TURNS[turn].T).astype(np.float32),
-            self._lobes[turn].astype(np.float32),
-        )
+        relit = (symmetry.apply(image, None, turn) for image in pair)
+        return (gbuffer, *relit, self._through(light, turn))
 
     def _packed(self, number: int, part: tuple[slice, ...]) -> NDArray[np.uint8]:
         file, index = self._file(number), self.entries[number].index
@@ -152,20 +140,14 @@ class Lit(Dataset):
         return reference.numpy(), irradiance.numpy()
 
     def _through(self, light: Float, turn: int) -> Float:
-        """(C, K): light through lobes, seen in a camera space turned by a symmetry."""
-        return np.asarray(light.T @ self._lobes[turn].T, np.float32)
+        """(C, TERMS, SECTORS): light through lobes, in a camera space turned by a symmetry."""
+        return np.asarray((self._lobes[turn] @ light).transpose(2, 0, 1), np.float32)
 
 
 def _part(side: int, rng: np.random.Generator) -> slice:
     """`SIDE` of `side` pixels."""
     start = int(rng.integers(max(0, side - SIDE) + 1))
     return slice(start, start + min(SIDE, side))
-
-
-def _shares(towards: Float, lamps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(K, L): how much of each lamp is seen through the lobe about each direction."""
-    lobes = np.maximum(towards @ lamps.T, 0) ** 2.0**LEVEL
-    return np.asarray(lobes / lobes.sum(1, keepdims=True))
 
 
 def _lamps(normal: Float, rng: np.random.Generator) -> Float:

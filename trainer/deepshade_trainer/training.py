@@ -34,7 +34,6 @@ SAVE_EVERY = 250
 VALIDATE_EVERY = 500
 VALIDATION_SAMPLES = 96
 MAX_BAD_BATCHES = 100
-OPEN = 10.0  # the weight of `Shader.lit`'s error: about as much as the picture's then
 
 
 @dataclass(frozen=True)
@@ -75,8 +74,7 @@ class _Trainer:
         runs = self.shader.per_channel
         self.data: Dataset
         if isinstance(self.network, Openings):
-            towards = self.network.towards.numpy(force=True)
-            self.data = Lit(folders, recipe.effect, towards, self.network.config.fold)
+            self.data = Lit(folders, recipe.effect)
         elif self.device.type == "cpu":
             self.data = Dataset(folders, recipe.effect, per_channel=runs)
         else:
@@ -223,8 +221,8 @@ class _Trainer:
         mixed = recipe.precision == "bf16"
         given = [each.to(self.device) for each in batch.light]
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
-            image, error = self._answered(self.shader, gbuffer, given)
-        loss = self.loss(*self.shader.compared(image, reference)) + OPEN * error
+            image = self._answered(self.shader, gbuffer, given)
+        loss = self.loss(*self.shader.compared(image, reference))
         self.optimizer.zero_grad(set_to_none=True)
         if not torch.isfinite(loss):
             return math.nan, f"loss {float(loss)}"
@@ -244,16 +242,12 @@ class _Trainer:
         return float(loss.detach()), ""
 
     @staticmethod
-    def _answered(
-        shader: Shader, gbuffer: Tensor, given: Sequence[Tensor]
-    ) -> tuple[Tensor, Tensor]:
-        """The answer on the transfer curve, as large as the G-buffer; and `Shader.lit`'s error."""
+    def _answered(shader: Shader, gbuffer: Tensor, given: Sequence[Tensor]) -> Tensor:
+        """The answer on the transfer curve, as large as the G-buffer."""
         height, width = gbuffer.shape[2:]
         padded = shader.padded(gbuffer)
-        image, error = (
-            shader.lit(padded, *given) if given else (shader.on_curve(padded), torch.zeros(()))
-        )
-        return image[:, :, :height, :width], error
+        image = shader.lit(padded, *given) if given else shader.on_curve(padded)
+        return image[:, :, :height, :width]
 
     def _validate(self, log: Any, step: int) -> dict[str, float]:
         """Mean DSSIM and MAE of the averaged weights, beside the trivial answer's DSSIM."""
@@ -267,8 +261,7 @@ class _Trainer:
             gbuffer, light, sample = self.data.judged(number)
             given = [each.to(self.device) for each in light]
             with torch.inference_mode():
-                found, _ = self._answered(shader, gbuffer.to(self.device), given)
-                found = shader.bounded(found)
+                found = shader.bounded(self._answered(shader, gbuffer.to(self.device), given))
             answer = found.cpu().flatten(0, 1).numpy()
             reference, blank = sample[self.data.reference], sample["trivial"]
             image, truth, nothing = (

@@ -80,7 +80,7 @@ def render(
         str, typer.Option(help="Attributes to write, commas between. Default: all.")
     ] = "",
     layers: Annotated[
-        str, typer.Option(help="More to render, commas between: do_visibility, do_directions.")
+        str, typer.Option(help="More to render, commas between: do_directions.")
     ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
@@ -282,7 +282,7 @@ def datagen(
     ] = None,
     skies: Annotated[int, typer.Option(help="How many different skies.", min=0)] = 64,
     layers: Annotated[
-        str, typer.Option(help="More to render, commas between: do_visibility, do_directions.")
+        str, typer.Option(help="More to render, commas between: do_directions.")
     ] = "",
     shard_size: Annotated[
         int | None,
@@ -304,7 +304,7 @@ def datagen(
         --effects ao,gi --textures pictures --views 2048
 
       deepshade datagen --out data/env --scenes procedural --effects do,ibl,full \
-        --environments maps --layers do_visibility --views 2048
+        --environments maps --layers do_directions --views 2048
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """

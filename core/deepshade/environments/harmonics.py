@@ -56,13 +56,3 @@ def projected(
         seen = np.tensordot(np.asarray(to_map).T, seen, axes=1)
     weighted = environment.radiance * solid_angles(height, width)[:, None]
     return np.stack([(weighted * basis).sum((1, 2)) for basis in harmonics(*seen)], axis=1)
-
-
-def turning(matrix: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """(16, 16) M with Y(`matrix` d) = M Y(d) for all d; `matrix` (3, 3) turns, or mirrors.
-
-    What has the coefficients c has M c after it was turned so, as M is orthogonal.
-    """
-    points = directions(8, 16).reshape(3, -1)  # more than enough to tell 16 functions apart
-    before, after = (np.stack(harmonics(*d)) for d in (points, np.asarray(matrix) @ points))
-    return np.asarray(after @ np.linalg.pinv(before))

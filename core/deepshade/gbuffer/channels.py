@@ -95,8 +95,8 @@ def layers(headers: Sequence[Header], stems: Sequence[str]) -> list[Layer]:
                 found[key] = Layer(file, name)
             found[key].components.setdefault(component, []).append(qualified)
         own = [layer for (at, _, _), layer in found.items() if at == file and layer.name != "A"]
-        # a file that holds one nameless layer is about what its own name says
-        if len(own) == 1 and not own[0].name and stem:
+        # a file that holds one nameless layer, or grey, is about what its own name says
+        if len(own) == 1 and own[0].name in ("", "Y", "V", "L") and stem:
             own[0].name, own[0].from_stem = stem, True
     return list(found.values())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -14,14 +14,20 @@ from numpy.typing import NDArray
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera, placement_of
-from deepshade.errors import CameraError, ConfigError, ImageError, MissingAttributeError
+from deepshade.errors import ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
 from deepshade.exr.entries import Entry
 from deepshade.gbuffer import background, channels, derivation
+from deepshade.gbuffer.checks import Verdict, examine
+from deepshade.gbuffer.conventions import Conventions, apply
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
-from deepshade.gbuffer.profiles import QUANTITIES
+from deepshade.gbuffer.profiles import QUANTITIES, number
+from deepshade.gbuffer.repair import repair
+from deepshade.gbuffer.sources import passed_over
 
 Source = Path | str | bytes | tuple[str, bytes]
+# quantities that were read to choose between them, and whether they hold NaN or infinities
+_Read = dict[channels.Choice, tuple[NDArray[np.float32], bool]]
 
 
 @dataclass(slots=True)
@@ -33,10 +39,10 @@ class GBuffer:
     the pixels that held NaN or infinities (an infinite depth is a renderer's way to say
     background and doesn't count). `mapped` tells which channels each quantity came from,
     `decoded` all that were read for that, as (file, channel), and `derived` how the others were
-    computed. The windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes
-    came from, `part_header` its own attributes, `entries` those of the shot; `header` holds those
-    of all parts and files, the first of each name. `up` is the world's up axis, as its renderer
-    has it.
+    computed, or how what is there had to be read; `warnings` say what looks unlikely. The
+    windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes came from,
+    `part_header` its own attributes, `entries` those of the shot; `header` holds those of all
+    parts and files, the first of each name. `up` is the world's up axis, as its renderer has it.
     """
 
     attributes: dict[str, NDArray[np.float32]]
@@ -46,6 +52,7 @@ class GBuffer:
     mapped: dict[str, str] = field(default_factory=dict)
     decoded: tuple[tuple[int, str], ...] = ()
     derived: dict[str, str] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
     header: dict[str, Any] = field(default_factory=dict)
     part_header: dict[str, Any] = field(default_factory=dict)
     entries: dict[str, Entry] = field(default_factory=dict)
@@ -81,6 +88,9 @@ class _Job:
     choices: dict[str, channels.Choice]
     steps: dict[str, derivation.Derivation]
     part: exr.Part
+    used: frozenset[str]
+    conventions: Conventions
+    radius: float | None
 
 
 def load_gbuffer(sources: Source | Sequence[Source], needs: Sequence[str], **how: Any) -> GBuffer:
@@ -98,6 +108,8 @@ def load_gbuffers(
     limits: Limits | None = None,
     headers: Sequence[Header] | None = None,
     anew: Collection[str] = (),
+    conventions: Conventions | None = None,
+    radius: float | None = None,
 ) -> Generator[GBuffer]:
     """Loads one EXR file, or several of one view, for each of `needs`: names of attributes.
 
@@ -105,6 +117,8 @@ def load_gbuffers(
     (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
     comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
     What isn't there, or is to be `anew`, is derived (`derivation`): `GBuffer.derived` says how.
+    `conventions` say how values are stored, and which checks they have to pass (`checks`).
+    Positions whose steps are coarse beside the `radius` (by default the header's) are smoothed.
     `headers` are what `exr.read_header` gave for the same sources, to spare reading them again.
 
     Each G-buffer is what it would be alone. They share arrays, and so what is decoded and derived
@@ -112,8 +126,9 @@ def load_gbuffers(
     doesn't, each is decoded when it is asked for.
 
     Raises ImageError, DamagedImageError, LimitError, MissingAttributeError,
-    AmbiguousChannelError, CameraError, ConfigError.
+    AmbiguousChannelError, CameraError, ContradictionError, ConfigError.
     """
+    conventions = conventions or Conventions()
     limits = limits or Limits()
     every = list(dict.fromkeys(name for each in needs for name in each))
     for name in every:
@@ -125,47 +140,69 @@ def load_gbuffers(
     limits.check("channels", sum(len(p.channels) for header in headers for p in header.parts))
     limits.check("decoded_bytes", sum(header.decoded_bytes for header in headers))
 
+    read: _Read = {}
+
+    def reader(choices: Mapping[str, channels.Choice]) -> Mapping[str, NDArray[np.float32]]:
+        missing = {name: c for name, c in choices.items() if c not in read}
+        arrays, suspects = _read(bodies, headers, missing, limits, {})
+        read.update({missing[name]: (arrays[name], name in suspects) for name in missing})
+        return {name: read[choice][0] for name, choice in choices.items()}
+
     def plan(wanted: Sequence[str]) -> Plan:
         found = plan_gbuffer(headers, stems, wanted, profile=profile, mapping=mapping, fov=fov)
-        for name in anew:
+        found.passed_over = passed_over(found, mapping or {}, conventions, reader)
+        for name in (*anew, *found.passed_over):
             found.choices.pop(name, None)
         found.require(wanted)
         return found
 
     try:
-        jobs = [_job(each, plan(each), mapping or {}) for each in needs]
+        jobs = [_job(each, plan(each), mapping or {}, conventions, radius) for each in needs]
     except MissingAttributeError:
         if len(needs) > 1:
             plan(every)  # which says all that is missing
         raise
     if len({job.part.data_window for job in jobs}) > 1:
         raise ImageError("the attributes cover different pixels", fix="render them as one view")
-    yield from _load(jobs, bodies, headers, limits)
+    yield from _load(jobs, bodies, headers, limits, read)
 
 
-def _job(needs: Sequence[str], plan: Plan, mapping: Collection[str]) -> _Job:
+def _job(
+    needs: Sequence[str],
+    plan: Plan,
+    mapping: Collection[str],
+    conventions: Conventions,
+    radius: float | None,
+) -> _Job:
     steps: dict[str, derivation.Derivation] = {}
     for name in needs:
         for step in derivation.plan(name, {*plan.choices, *steps}, plan.met) or ():
             steps.setdefault(step.target, step)
     used = {*needs, *(need for step in steps.values() for need in step.needs)}
     choices = chosen(plan, used, mapping)
+    for name in conventions.axes:  # of the file: a profile's signs no longer count
+        if name in choices:
+            choices[name] = replace(choices[name], signs=())
     part = plan.parts(next(iter(choices.values())))[0]
     if plan.camera:
         plan.camera = framed(plan.camera, part)
-    return _Job(needs, plan, choices, steps, part)
+    return _Job(needs, plan, choices, steps, part, frozenset(used), conventions, radius)
 
 
 def _load(
-    jobs: Sequence[_Job], bodies: Sequence[bytes], headers: Sequence[Header], limits: Limits
+    jobs: Sequence[_Job],
+    bodies: Sequence[bytes],
+    headers: Sequence[Header],
+    limits: Limits,
+    read: _Read,
 ) -> Generator[GBuffer]:
     """The jobs' G-buffers: together if they are then what they are alone, else one by one."""
-    loaded = _together(jobs, bodies, headers, limits) if _agree(jobs) else None
+    loaded = _together(jobs, bodies, headers, limits, read) if _agree(jobs) else None
     if loaded is None:
         for job in jobs:
-            yield from _load([job], bodies, headers, limits)
+            yield from _load([job], bodies, headers, limits, read)
         return
-    arrays, empty, nonfinite = loaded
+    arrays, empty, nonfinite, verdict = loaded
     for job in jobs:
         yield GBuffer(
             attributes={name: arrays[name] for name in job.needs},
@@ -174,7 +211,8 @@ def _load(
             nonfinite=nonfinite,
             mapped={name: str(choice) for name, choice in job.choices.items()},
             decoded=tuple((c.file, name) for c in job.choices.values() for name in c.channels),
-            derived={name: job.plan.how(step) for name, step in job.steps.items()},
+            derived=_said(job, verdict),
+            warnings=tuple(verdict.warnings),
             header=job.plan.attributes,
             part_header=job.part.attributes,
             entries=job.part.entries,
@@ -206,25 +244,59 @@ def _matrix(plan: Plan) -> NDArray[np.float64]:
 
 
 def _together(
-    jobs: Sequence[_Job], bodies: Sequence[bytes], headers: Sequence[Header], limits: Limits
-) -> tuple[dict[str, NDArray[np.float32]], NDArray[np.bool_], int] | None:
-    """(the attributes of all jobs, the background, how many pixels held NaN or infinities).
+    jobs: Sequence[_Job],
+    bodies: Sequence[bytes],
+    headers: Sequence[Header],
+    limits: Limits,
+    read: _Read,
+) -> tuple[dict[str, NDArray[np.float32]], NDArray[np.bool_], int, Verdict] | None:
+    """(the attributes of all jobs, the background, how many pixels held NaN or infinities, what
+    the checks found).
 
     None where a job's background or count would be another's.
     """
     choices = {name: choice for job in jobs for name, choice in job.choices.items()}
-    arrays, suspects = _read(bodies, headers, choices, limits)
+    arrays, suspects = _read(bodies, headers, choices, limits, read)
+    verdict = _checked(jobs, choices, arrays)
     if len(jobs) > 1 and not background.same(arrays, suspects, [job.choices for job in jobs]):
         return None
     empty, nonfinite = background.remove(arrays, suspects)
+    plan = jobs[0].plan
+    if jobs[0].conventions.checks != "trust":
+        reach = jobs[0].radius or number(plan.attributes, "deepshade:radius")
+        mended = repair(arrays, ~empty, plan.camera, plan.matrix, reach if reach > 0 else None)
+        for name, note in mended.items():
+            verdict.note(name, note)
     steps = {name: step for job in jobs for name, step in job.steps.items()}
     if steps:
         empty, more = _derive(steps.values(), jobs[0].plan, arrays, empty)
         if more and len(jobs) > 1:
             return None
         nonfinite += more
-    _check_side(arrays, empty)
-    return {name: arrays[name] for job in jobs for name in job.needs}, empty, nonfinite
+    return {name: arrays[name] for job in jobs for name in job.needs}, empty, nonfinite, verdict
+
+
+def _checked(
+    jobs: Sequence[_Job],
+    choices: Mapping[str, channels.Choice],
+    arrays: dict[str, NDArray[np.float32]],
+) -> Verdict:
+    """Examines what was read, and turns it into our conventions."""
+    plan, used = jobs[0].plan, {name for job in jobs for name in job.used}
+    coarse = any(plan.half(choices[name]) for name in choices if name.startswith("position"))
+    given = plan.camera, plan.matrix, jobs[0].conventions
+    verdict = examine(arrays, used, *given, coarse=coarse)
+    apply(verdict.readings, arrays, plan.camera)
+    return verdict
+
+
+def _said(job: _Job, verdict: Verdict) -> dict[str, str]:
+    """How what the job needs was derived, and how what that came from had to be read."""
+    derived = {name: job.plan.how(step) for name, step in job.steps.items()}
+    for name, note in verdict.notes.items():
+        if name in job.choices:
+            derived[name] = f"{derived[name]}; {note}" if name in derived else note
+    return derived
 
 
 def source_name(field: str, filename: str) -> str:
@@ -276,31 +348,24 @@ def _derive(
     return ~source.valid, grown
 
 
-def _check_side(arrays: Mapping[str, NDArray[np.float32]], background: NDArray[np.bool_]) -> None:
-    """Raises CameraError when positions lie behind the camera: another renderer's convention."""
-    if "position" not in arrays or arrays["position"][2].max() <= 0:
-        return
-    behind = int(np.count_nonzero(arrays["position"][2] > 0))
-    visible = int(np.count_nonzero(~background))
-    if 2 * behind > visible:
-        raise CameraError(
-            f"{behind} of {visible} positions lie behind the camera, which looks down -z",
-            fix="if they are in world space: --map position_world=<layer>; "
-            "if the renderer's camera looks down +z, name it: --profile renderman",
-        )
-
-
 def _read(
     bodies: Sequence[bytes],
     headers: Sequence[Header],
     choices: Mapping[str, channels.Choice],
     limits: Limits,
+    read: _Read,
 ) -> tuple[dict[str, NDArray[np.float32]], set[str]]:
-    """(the chosen quantities, which of them hold NaN or infinities)."""
+    """(the chosen quantities, which of them hold NaN or infinities).
+
+    What was `read` before is taken from there: arrays are worked on in place.
+    """
     arrays: dict[str, NDArray[np.float32]] = {}
     suspects: set[str] = set()
     for index, (body, header) in enumerate(zip(bodies, headers, strict=True)):
         mine = {name: choice for name, choice in choices.items() if choice.file == index}
+        for name in [name for name in mine if mine[name] in read]:
+            arrays[name], suspect = read.pop(mine.pop(name))
+            suspects |= {name} if suspect else set()
         if not mine:
             continue
         wanted = [channel for choice in mine.values() for channel in choice.channels]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ class Plan:
     camera: Camera | None
     matrix: NDArray[np.float64] | None
     attributes: dict[str, Any]
+    passed_over: dict[str, str] = field(default_factory=dict)  # quantity -> why
 
     def steps(self, attribute: str) -> list[derivation.Derivation] | None:
         """Derivations that lead to `attribute`; [] if it is in the files, None if impossible."""
@@ -62,6 +63,13 @@ class Plan:
         places = self._places(choice)
         return [self.headers[choice.file].parts[places[name][0]] for name in choice.channels]
 
+    def half(self, choice: channels.Choice) -> bool:
+        """Whether any of its channels has 16 bits."""
+        places = self._places(choice)
+        parts = self.headers[choice.file].parts
+        kinds = [parts[places[name][0]].channels[places[name][1]] for name in choice.channels]
+        return "half" in kinds
+
     def explain(self, attribute: str) -> str:
         """Why `attribute` can't be had, for errors and reports."""
         if attribute in self.ambiguous:
@@ -73,6 +81,8 @@ class Plan:
         """How a derivation gets its attribute, and what it had to pass over."""
         if step.target == "normal" and "position" in step.needs and "normal_world" in self.choices:
             return f"{step.how} (the world-space normals there need worldToCamera)"
+        if step.target == "position" and self.passed_over:
+            return f"{step.how} ({'; '.join(self.passed_over.values())})"
         return step.how
 
     def require(self, needs: Sequence[str]) -> None:

@@ -78,10 +78,11 @@ def match_rank(layer: str, alias: str, *, from_stem: bool = False) -> int | None
 
     Prefixes end at a dot, slash or colon ("ViewLayer.Normal"), or at an underscore for aliases of
     three letters and more ("shot_normal"); file stems (`from_stem`) may have any of those, and a
-    frame number at the end. None when it doesn't fit.
+    frame number, a version ("v012") or the name of a grey channel at the end. None when it doesn't
+    fit.
     """
     if from_stem:
-        layer = re.sub(r"[._\-\s]*\d+$", "", layer)
+        layer = re.sub(r"([._\-\s]*\d+|[._\-\s]+(v\d+|[yvl]))+$", "", layer, flags=re.I)
         layer = re.sub(r"[_\-\s]+", ".", layer)
         alias = alias.replace("_", ".")
     lower, wanted = layer.lower(), alias.lower()
@@ -195,6 +196,16 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("motionFore",), _UP_TO_DOWN),
         ),
         _signed("rman", "prman", "PixarRenderMan", "renderman"),
+    ),
+    Profile(
+        "pbrt",  # its G-buffer film, in camera space (coordinateSystem "camera", the default)
+        (
+            Source("position", ("P",), _INTO_SCREEN),
+            Source("normal", ("Ns",), _INTO_SCREEN),
+            Source("diffuse", ("Albedo",)),
+        ),
+        lambda header: {"samplesPerPixel", "renderTimeSeconds"} <= header.keys(),
+        free_names=True,
     ),
     Profile(
         "vray",

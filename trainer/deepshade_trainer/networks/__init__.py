@@ -70,7 +70,12 @@ def network_config(settings: Mapping[str, Any], base: NetworkConfig | None = Non
         if key not in known:
             raise ConfigError(key, known)
     values: dict[str, Any] = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in settings.items()
+        k: network_config(v, getattr(base, k))
+        if isinstance(v, Mapping)
+        else tuple(v)
+        if isinstance(v, list)
+        else v
+        for k, v in settings.items()
     }
     return dataclasses.replace(base, **values)
 

@@ -1,55 +1,47 @@
-"""Our network for light from all around: geometry decides what is open to each direction."""
+"""Our network for light from all around: geometry decides what is blocked in each direction."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from functools import reduce
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deepshade.environments.lamps import fibonacci
 from deepshade.errors import ConfigError
+from deepshade_trainer.networks import slices
 from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
 from deepshade_trainer.networks.horizons import covered, unit
 from deepshade_trainer.networks.network import Network, check_types
-from deepshade_trainer.networks.receptive_field import Span
+from deepshade_trainer.networks.receptive_field import Span, folded, grown, joined
 from deepshade_trainer.networks.reflections import blurred, mean, turned
 
-# Of a sample: row and column of a pixel in its cells; which directions it is open to
-# (directions, h, w); these (directions, 3); and how much of each a lobe sees (lobes, directions).
-Probe = tuple[Tensor, Tensor, Tensor, Tensor]
-
 LEVEL = 5  # the map is seen through lobes of exponent 2^LEVEL
-_HALVES = 4  # vectors are found for 2 x 2 parts of a cell
 _SURFACE = 0.25  # the square of a normal's length; background has none
+_APART = 0.025  # distances from a pixel's plane at which a cell no longer tells of it, over depth
+_SMOOTHED = 0.15  # effect radii from which on cells don't lend each other what is blocked
+_TRUST = 0.75  # in `ao` of the trunk against W: so that a white map gives `ao` to .01
+_MOST = 4.0  # what is blocked is multiplied by at most that, to be as much as `ao` says
+_LEAST = 0.02  # of that which is blocked, to be multiplied
 
 
 @dataclass(frozen=True)
 class OpeningsConfig:
-    """The shape of the trunk (`FoldConfig`), and of what it tells.
+    """The shape of the trunk, which is that of ambient occlusion, and of what looks at slices.
 
-    `features` of a cell say what is open, in as many `directions`. `world`, `normal` and `position`
-    are the first of three channels of the G-buffer each: the normal in world space and in camera
-    space, and the position.
+    `hidden` are the channels between its layers. `world` and `normal` are the first of the three
+    channels of the normal, in world space and in camera space; positions follow the latter.
     """
 
     kind: str = "openings"
     inputs: int = 9
     outputs: int = 3
-    features: int = 64
-    directions: int = 96
-    widths: tuple[int, ...] = (48, 96, 128)
-    steps: tuple[int, ...] = (4, 2)
-    down: tuple[int, ...] = (1, 2, 2)
-    up: tuple[int, ...] = (2, 2)
-    fold: int = 4
-    rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
-    fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
-    detail: tuple[int, ...] = (1, 1)
-    bias: float = 0.85
+    trunk: FoldConfig = field(default_factory=lambda: FoldConfig(normal=0, position=3, bias=0.85))
+    hidden: int = 24
     world: int = 0
     normal: int = 3
     position: int = 6
@@ -57,49 +49,60 @@ class OpeningsConfig:
     def __post_init__(self) -> None:
         """Raise ConfigError where entries don't fit each other."""
         check_types(self)
-        for name in ("features", "directions"):
-            if getattr(self, name) < 1:
-                raise ConfigError(name, detail=f"{name} must be 1 or more")
-        if self.fold % 2:
-            raise ConfigError("fold", detail="fold must be even")
-        if self.normal + 3 != self.position:
+        if self.hidden < 1:
+            raise ConfigError("hidden", detail="hidden must be 1 or more")
+        if self.trunk.fold != slices.CELL:
+            raise ConfigError("fold", detail="the trunk's fold must be 4")
+        if (self.trunk.normal, self.trunk.position) != (0, 3) or self.normal + 3 != self.position:
             raise ConfigError("position", detail="positions must follow normals")
-        _ = self.trunk
-
-    @property
-    def trunk(self) -> FoldConfig:
-        """The network that ambient occlusion has too."""
-        names = ("widths", "steps", "down", "up", "fold", "rings", "fine_rings", "detail", "bias")
-        shared: dict[str, Any] = {name: getattr(self, name) for name in names}
-        return FoldConfig(inputs=6, outputs=1, normal=0, position=3, **shared)
 
 
 class Openings(Network):
-    """Light from all around (N, 3, H, W) where a surface lies open to it:
+    """Light from all around (N, 3, H, W), less what the surroundings of a surface block of it.
 
-        ao I(N) + Σ_k (r_k + N·v_k) (E_k - Ē)
+    I is the irradiance over π of the open surface, looked up. Of it
 
-    I is the irradiance over π of the open surface, looked up; E_k is the map through a lobe about
-    the k-th of many directions in camera space, and Ē their mean. The trunk gives ao, and features
-    from which r_k and v_k are made linearly. So the sum over k is done first, on the weights, and
-    costs nothing however many there are; the answer is linear in the map; and under a white one it
-    is ao. Where there is no surface stands the map's mean.
+        B = Σ_k c_k Ω/π N·ω_k E_k
+
+    is blocked: ω_k are the sectors of the slices through a cell (`slices`), Ω their solid angle,
+    E_k the map through a lobe about ω_k. How much of each is blocked, c_k, is calculated, and a
+    small network corrects it that sees one slice and what the trunk knows of the cell. A pixel has
+    B from the cells around it that lie in its plane; and W, the same of a white map. The trunk says
+    how much light is left under a white one, `ao`: an estimate as good as 1 - W, with errors of
+    its own. The answer has a weighted geometric mean of both:
+
+        I - B ((1 - ao) / W)^t
+
+    It is linear in the map. Where there is no surface stands the map's mean. The trunk is that of
+    `ao` and stays as it was trained there.
     """
 
     linear = True
     rounded = "trunk."
     environment = ("lobes", "turn", "camera")
     towards: Tensor
+    fit: Tensor
+    cosines: Tensor
 
     def __init__(self, config: OpeningsConfig) -> None:
         super().__init__()
         self.config = config
-        self.trunk = _Trunk(config)
-        self.planes = 3 * _HALVES + config.fold**2
-        weights = torch.randn(config.directions, self.planes * config.features)
-        self.weights = nn.Parameter(weights * 0.02)
-        towards = torch.from_numpy(fibonacci(config.directions).T).float()
-        self.register_buffer("towards", towards[None, :, None], persistent=False)
+        self.trunk = FoldUNet(config.trunk)
+        hidden = config.hidden
+        self.see = nn.Conv2d(slices.HEIGHTS + 2, hidden, 3, padding=1)
+        self.know = nn.ModuleList(
+            nn.Conv2d(config.trunk.widths[0], hidden, 1, bias=False) for _ in range(slices.AZIMUTHS)
+        )
+        self.block = nn.Conv2d(hidden, slices.HEIGHTS, 1, bias=False)
+        nn.init.zeros_(self.block.weight)
+        toward, fit = slices.nodes()
+        for name, value in (
+            ("towards", toward.reshape(1, -1, 3).transpose(0, 2, 1)[..., None]),
+            ("fit", fit),
+            ("cosines", slices.sectors()[0].T * (slices.sectors()[1] / math.pi)),
+        ):
+            constant = torch.from_numpy(np.ascontiguousarray(value, np.float32))
+            self.register_buffer(name, constant, persistent=False)
 
     @property
     def size_multiple(self) -> int:
@@ -108,7 +111,12 @@ class Openings(Network):
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        return self.trunk.receptive_field(pixel)
+        cell = pixel // slices.CELL
+        # of the cells around a pixel, those around them, and what these convolve with
+        seen = folded(grown((cell, cell), 3 + slices.REACH), slices.CELL)
+        # its pixels depend on the cells around theirs
+        spans = (self.trunk.receptive_field((cell + k) * slices.CELL) for k in (-1, 0, 1))
+        return reduce(joined, spans, joined(seen, self.trunk.receptive_field(pixel)))
 
     def forward(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
         """(1, 9, H, W), the table of `environments.lobes`, the turns from world and from camera to
@@ -122,93 +130,55 @@ class Openings(Network):
             surface = (normal * normal).sum(1, keepdim=True) > _SURFACE
             surface = surface & (self._covered(gbuffer) > 0)
             irradiance = torch.where(surface, seen, around)
-            through = blurred(lobes, turned(self.towards, camera), LEVEL)  # (1, 3, 1, K)
-        return self.lit(gbuffer, irradiance, through[:, :, 0])
+            through = blurred(lobes, turned(self.towards, camera), LEVEL)
+            through = self.fit @ through.reshape(1, 3, -1, slices.SECTORS)
+        return self.lit(gbuffer, irradiance, through)
 
     def lit(self, gbuffer: Tensor, irradiance: Tensor, through: Tensor) -> Tensor:
         """(N, C, H, W) for a G-buffer under C / 3 maps at once.
 
         `irradiance` (N, C, H, W) is that of the open surface, over π, and of background the map's
-        mean; `through` (N, C, directions) the maps in camera space, through lobes.
+        mean; `through` (N, C, TERMS, SECTORS) are E_k as polynomials (`slices.lobes`).
         """
-        return self._lit(gbuffer, *self.told(gbuffer), irradiance, through)
-
-    def told(self, gbuffer: Tensor) -> tuple[Tensor, Tensor]:
-        """Ambient occlusion (N, 1, H, W), and features (N, features, h, w) of cells."""
-        occlusion, features = self.trunk(gbuffer, self.config.normal)
-        return occlusion, features.float()
-
-    def learnt(
-        self, gbuffer: Tensor, irradiance: Tensor, through: Tensor, probes: Sequence[Probe]
-    ) -> tuple[Tensor, Tensor]:
-        """`lit`, and the mean square error of what is open to each direction, times its cosine.
-
-        A probe is of one sample each, at one pixel of every cell.
-        """
-        occlusion, features = self.told(gbuffer)
-        errors = [
-            self._error(gbuffer[k], occlusion[k, 0], features[k], *probe)
-            for k, probe in enumerate(probes)
-        ]
-        return self._lit(gbuffer, occlusion, features, irradiance, through), torch.stack(
-            errors
-        ).mean()
-
-    def _error(
-        self,
-        gbuffer: Tensor,
-        occlusion: Tensor,
-        features: Tensor,
-        at: Tensor,
-        open_: Tensor,
-        towards: Tensor,
-        shares: Tensor,
-    ) -> Tensor:
-        fold, first = self.config.fold, self.config.normal
-        row, column = (int(v) for v in at)
-        cells = gbuffer[:, row::fold, column::fold].flatten(1)  # (C, cells)
-        normal = unit(cells[None, first : first + 3, None])[0, :, 0]
-        half = row * 2 // fold * 2 + column * 2 // fold
-        planes = [*(axis * _HALVES + half for axis in range(3))]
-        planes.append(3 * _HALVES + row * fold + column)
-        weights = self.weights.reshape(len(self.weights), self.planes, -1)[:, planes]
-        told = weights @ features.flatten(1) * (1 / self.config.features)  # (K, 4, cells)
-        blend = (told[:, :3] * normal).sum(1) + told[:, 3]
-        contrast = shares - shares.mean(0, keepdim=True)  # (K, directions)
-        cosine = (towards @ normal).clamp_min(0)
-        there = occlusion[row::fold, column::fold].flatten()
-        found = there * cosine + contrast.T @ blend * (len(towards) / 4)
-        inside = covered(cells[first + 5])
-        return ((found - open_.flatten(1) * cosine) ** 2 * inside).mean()
-
-    def _lit(
-        self,
-        gbuffer: Tensor,
-        occlusion: Tensor,
-        features: Tensor,
-        irradiance: Tensor,
-        through: Tensor,
-    ) -> Tensor:
-        config, first = self.config, self.config.normal
+        with torch.no_grad():
+            cells = self.trunk.cells(gbuffer, self.config.normal)
+            occlusion = self.trunk.pixels(cells).clamp(0, 1)
         with full_precision():
-            count, colours, _ = through.shape
-            high, wide = features.shape[2:]
-            planes, width = self.planes, config.features
-            # divided, so that weights are learnt at the pace of all others
-            contrast = (through - through.mean(2, keepdim=True)) * (1 / width)
-            weights = contrast @ self.weights  # (N, C, planes * features)
-            weights = weights.reshape(count, colours * planes, width)
-            told = weights @ features.flatten(2)
-            told = told.reshape(count * colours, planes, high, wide)
-            vectors = F.pixel_shuffle(told[:, : 3 * _HALVES], 2)  # (N C, 3, 2h, 2w)
-            vectors = F.interpolate(vectors, scale_factor=config.fold / 2, mode="nearest")
-            rest = F.pixel_shuffle(told[:, 3 * _HALVES :], config.fold)
-            normal = unit(gbuffer[:, first : first + 3])
-            size = normal.shape[2:]
-            vectors = vectors.reshape(count, colours, 3, *size)
-            learnt = (vectors * normal[:, None]).sum(2) + rest.reshape(count, colours, *size)
-            inside = self._covered(gbuffer)
-            return irradiance + inside * ((occlusion - 1) * irradiance + learnt)
+            first = self.config.normal
+            folded = F.pixel_unshuffle(gbuffer[:, first : first + 6], slices.CELL)
+            folded = folded.reshape(len(folded), 6, slices.CELL**2, *folded.shape[2:])
+            at = folded[:, :, slices.TAKEN * (slices.CELL + 1)]
+            at = torch.cat([unit(at[:, :3]), at[:, 3:], covered(at[:, 5:])], 1)
+            with torch.no_grad():
+                seen = slices.slices(folded, at)
+        blocked = self._blocked(seen, cells).float()
+        with full_precision():
+            vectors = _smoothed(at, self._gathered(at, blocked, through))  # (N, 3, C + 1, h, w)
+            less = _at_pixels(folded, at, vectors)
+            less, white = less[:, :-1], less[:, -1:]
+            ratio = ((1 - occlusion) / white.clamp_min(_LEAST)).clamp(_LEAST**2, _MOST)
+            return irradiance - less * ratio**_TRUST * self._covered(gbuffer)
+
+    def _blocked(self, seen: Sequence[Tensor], cells: Tensor) -> Tensor:
+        """What of each sector is blocked, (N, SECTORS, h, w)."""
+        found = []
+        for one, know in zip(seen, self.know, strict=True):
+            learnt = self.block(F.relu(self.see(one) + know(cells)))
+            found.append(one[:, : slices.HEIGHTS] + learnt)
+        return torch.cat(found, 1)
+
+    def _gathered(self, at: Tensor, blocked: Tensor, through: Tensor) -> Tensor:
+        """Σ_k c_k Ω_k/π ω_k E_k in camera space, (N, 3, C + 1, h, w); the last for a white map."""
+        count, colours = through.shape[:2]
+        high, wide = at.shape[2:]
+        eye, flat = slices.toward_eye(at[:, 3:6]), blocked.flatten(2)
+        weights = through[:, None] * self.cosines[None, :, None, None]  # (N, 3, C, TERMS, SECTORS)
+        told = weights.reshape(count, -1, slices.SECTORS) @ flat
+        told = told.reshape(count, 3, colours, slices.TERMS, high, wide)
+        light = (told * slices.place(eye)[:, None, None]).sum(3)
+        white = (self.cosines @ flat).reshape(count, 3, 1, high, wide)
+        vectors = torch.cat([light, white], 2) * at[:, None, 6:]
+        return slices.out_of_frame(eye[:, :, None], vectors)
 
     def _covered(self, gbuffer: Tensor) -> Tensor:
         last = self.config.position + 2
@@ -219,15 +189,79 @@ class Openings(Network):
         self.trunk.prepare_export()
 
 
-class _Trunk(FoldUNet):
-    """Ambient occlusion (N, 1, H, W), and features (N, features, h, w) of each cell."""
+def _at_pixels(folded: Tensor, at: Tensor, vectors: Tensor) -> Tensor:
+    """N·v at each pixel (N, C, H, W), of the v (N, 3, C, h, w) of the four cells around it.
 
-    def __init__(self, config: OpeningsConfig) -> None:
-        super().__init__(config.trunk)
-        self.tells = nn.Conv2d(config.widths[0], config.features, 3, padding=1)
+    Each counts by how near the pixel it was taken (the third of four each way), how near to the
+    pixel's plane, and how its normal agrees.
+    """
+    count, _, colours, high, wide = vectors.shape
+    folded = folded.reshape(count, 6, 4, 4, high, wide)
+    around = F.pad(torch.cat([at, vectors.flatten(1, 2)], 1), (1, 1, 1, 1))
+    rows = []
+    for top in (0, 2):  # the same four cells are around all pixels of a quarter of a cell
+        row = []
+        for left in (0, 2):
+            quarter = folded[:, :, top : top + 2, left : left + 2].reshape(count, 6, 4, high, wide)
+            found = _of_quarter(quarter, around, top, left, colours)
+            row.append(found.reshape(count, colours, 2, 2, high, wide))
+        rows.append(torch.cat(row, 3))
+    return F.pixel_shuffle(torch.cat(rows, 2).reshape(count, colours * 16, high, wide), 4)
 
-    def forward(  # type: ignore[override]
-        self, gbuffer: Tensor, first: int = 0
-    ) -> tuple[Tensor, Tensor]:
-        x = self.cells(gbuffer, first)
-        return self.pixels(x), F.relu(self.tells(x))
+
+def _of_quarter(quarter: Tensor, around: Tensor, top: int, left: int, colours: int) -> Tensor:
+    """The same (N, C, 4, h, w) for the 2 x 2 pixels (N, 6, 4, h, w) from (top, left) in a cell."""
+    normal, position = quarter[:, :3], quarter[:, 3:]
+    nx, ny, nz = torch.split(normal, 1, 1)
+    normal = normal * torch.rsqrt(nx * nx + ny * ny + nz * nz + 1e-12)
+    nx, ny, nz = torch.split(normal, 1, 1)  # (N, 1, 4, h, w)
+    total = sums = torch.zeros((), device=quarter.device)
+    for down in (0, 1):
+        for right in (0, 1):
+            first, second = down + top // 2, right + left // 2
+            there = F.pad(around, (-second, second - 2, -first, first - 2))[:, :, None]
+            shares = [
+                _share(top + i, down) * _share(left + j, right) for i in (0, 1) for j in (0, 1)
+            ]
+            near = torch.tensor(shares, device=quarter.device)[:, None, None] + 0.02
+            weight = near * _agreement(normal, position, there) + 1e-5 * there[:, 6:7]
+            vx, vy, vz = torch.split(there[:, 7:], colours, 1)  # (N, C, 1, h, w)
+            sums = sums + (vx * nx + vy * ny + vz * nz) * weight
+            total = total + weight
+    return sums / (total + 1e-9)
+
+
+def _smoothed(at: Tensor, vectors: Tensor) -> Tensor:
+    """Each cell's v (N, 3, C, h, w) with those of the eight around it that lie in its plane."""
+    normal, position = at[:, :3], at[:, 3:6]
+    around = F.pad(torch.cat([at, vectors.flatten(1, 2)], 1), (1, 1, 1, 1))
+    total = sums = torch.zeros((), device=at.device)
+    for down in (0, 1, 2):
+        for right in (0, 1, 2):
+            there = F.pad(around, (-right, right - 2, -down, down - 2))
+            near = (2 - abs(down - 1)) * (2 - abs(right - 1)) / 4
+            x, y, z = torch.split(there[:, 3:6] - position, 1, 1)
+            close = F.relu(1 - (x * x + y * y + z * z) * (1 / _SMOOTHED**2))
+            weight = _agreement(normal, position, there) * close * near
+            sums = sums + there[:, 7:] * weight
+            total = total + weight
+    return (sums / (total + 1e-9)).reshape(vectors.shape)
+
+
+def _agreement(normal: Tensor, position: Tensor, there: Tensor) -> Tensor:
+    """How far what is `there` (N, 7 or more, …) lies in the planes of (N, 3, …); 1 if it does."""
+    nx, ny, nz = torch.split(normal, 1, 1)
+    x, y, z = torch.split(position, 1, 1)
+    mx, my, mz, there_x, there_y, there_z, coverage = torch.split(there[:, :7], 1, 1)
+    agrees = (mx * nx + my * ny + mz * nz).clamp_min(0)
+    agrees = agrees * agrees
+    beside = (there_x - x) * nx + (there_y - y) * ny + (there_z - z) * nz
+    apart = z * _APART
+    flat = F.relu(1 - beside * beside / (apart * apart).clamp_min(1e-12))
+    return flat * flat * (agrees * agrees) * coverage
+
+
+def _share(row: int, second: int) -> float:
+    """Bilinear between the cells around a pixel of a row of four, of which the third was taken."""
+    part = (row - 2) / 4 % 1
+    return part if second else 1 - part

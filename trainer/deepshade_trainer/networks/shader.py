@@ -99,22 +99,12 @@ class Shader(nn.Module):
             return image
         return (image - self.background) * self._coverage(gbuffer) + self.background
 
-    def lit(
-        self, gbuffer: Tensor, irradiance: Tensor, through: Tensor, *probes: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """As `on_curve` (N J, 3, H, W), under J maps at once, and the error of `Openings.learnt`.
-
-        `probes` are the parts of its probes, of all samples each; without, the error is 0.
-        """
+    def lit(self, gbuffer: Tensor, irradiance: Tensor, through: Tensor) -> Tensor:
+        """As `on_curve` (N J, 3, H, W), under J maps at once: see `Openings.lit`."""
         (height, width), (rows, columns) = gbuffer.shape[2:], irradiance.shape[2:]
         irradiance = F.pad(irradiance, (0, width - columns, 0, height - rows), "replicate")
-        network = cast(Openings, self.network)
-        if probes:
-            each = list(zip(*probes, strict=True))
-            image, error = network.learnt(gbuffer, irradiance, through, each)
-        else:
-            image, error = network.lit(gbuffer, irradiance, through), torch.zeros(())
-        return image.reshape(-1, 3, *image.shape[2:]), error
+        image = cast(Openings, self.network).lit(gbuffer, irradiance, through)
+        return image.reshape(-1, 3, *image.shape[2:])
 
     def curve(self, image: Tensor) -> Tensor:
         """Light or answers through the transfer curve."""

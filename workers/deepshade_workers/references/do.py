@@ -1,8 +1,7 @@
 """Directional occlusion: the environment's light that nothing within a radius blocks.
 
-Also visibility itself, whatever the light (`visibility`): its product with a smooth map's spherical
-harmonics is the reference under that map. And which of many fixed directions are open
-(`directions`): the reference under any map made of as many distant lamps, without noise.
+Also which of many fixed directions are open, whatever the light (`directions`): the reference under
+any map made of as many distant lamps, without noise.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import drjit as dr
 import numpy as np
 
 from deepshade.camera import rotation_of
-from deepshade.environments.harmonics import COUNT, harmonics
 from deepshade.environments.lamps import DIRECTIONS
 from deepshade_workers.backend import mitsuba
 from deepshade_workers.environments import light_of
@@ -26,7 +24,6 @@ from deepshade_workers.view import Image, Images, View
 mi = mitsuba()
 
 STREAM = 0x646F0001
-VISIBILITY_STREAM = 0x646F0002
 
 
 def reference(
@@ -68,38 +65,6 @@ def reference(
     return hits.planar(value), hits.planar(error)
 
 
-def visibility(
-    scene: Scene, view: View, hits: Hits, images: Images, *, samples: int, seed: int
-) -> tuple[Image, Image]:
-    """(1/π)∫ V_R(ω) cosθ Y(ω) dω for the 16 spherical harmonics up to degree 3, in camera space.
-
-    `deepshade.environments.harmonics` has their order and sign. The first is ao / √4π.
-
-    Returns (16, H, W) and the standard error; background holds 0 and 0.
-    """
-    origin = offset_origin(hits.p, hits.ng, scene)
-    frame = mi.Frame3f(hits.ns)
-    reach = dr.opaque(mi.Float, view.radius)
-    right, up, back = (
-        mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in axis))
-        for axis in rotation_of(view.camera.matrix)
-    )
-
-    def opening(point: Any, first: Any, second: Any) -> Any:
-        direction = frame.to_world(mi.warp.square_to_cosine_hemisphere(point))
-        ray = mi.Ray3f(origin, direction, reach, 0.0, [])
-        valid = hits.valid & ~scene.traced.ray_test(ray, hits.valid)
-        basis = harmonics(*(dr.dot(axis, direction) for axis in (right, up, back)))
-        return mi.ArrayXf(*(dr.select(valid, value, 0) for value in basis))
-
-    found = stratified_mean(
-        opening, len(hits.valid), samples, seed ^ VISIBILITY_STREAM, channels=COUNT
-    )
-    shape = COUNT, hits.height, hits.width
-    value, error = (np.asarray(part.numpy(), np.float32).reshape(shape) for part in found)
-    return value, error
-
-
 def directions(
     scene: Scene, view: View, hits: Hits, images: Images, *, samples: int, seed: int
 ) -> tuple[Image, None]:
@@ -123,7 +88,4 @@ def directions(
     return np.stack(planes).reshape(-1, hits.height, hits.width), None
 
 
-LAYERS = {
-    "visibility": Layer(COUNT, visibility),
-    "directions": Layer(len(DIRECTIONS) // 8, directions, "uint8", exact=True),
-}
+LAYERS = {"directions": Layer(len(DIRECTIONS) // 8, directions, "uint8", exact=True)}
