@@ -21,7 +21,7 @@ README = Path(__file__).resolve().parent.parent / "README.md"
 # the last counts.
 SMALL = {
     "render": "--size 96x64 --spp 8",
-    "datagen": "--views 4 --size 64 --spp 8",
+    "datagen": "--views 4 --size 64 --spp 8 --shard-size 4",
     "train": "--preset fast --set steps=2 --set warmup=1 --set batch=2",
     "bench": "--models models --quick",
     "report": "--models models --quick --only error --views 1",

@@ -72,8 +72,8 @@ def read_mtl(text: str, resources: Resources, used: Sequence[str]) -> dict[str, 
 
     Kd and map_Kd are the base colour, Ks and Ns reflectance and exponent of the highlight where
     `illum` has one, d (or 1 - Tr) the opacity, times map_d: its alpha, or without one its grey,
-    unless it is map_Kd's own file, whose alpha counts anyway. Where Kd and Ks sum to more than 1 Ks is what Kd
-    leaves: no surface reflects more light than it gets.
+    unless it is map_Kd's own file, whose alpha counts anyway. Where Kd and Ks sum to more than 1
+    Ks is what Kd leaves: no surface reflects more light than it gets.
     """
     found: dict[str, dict[str, str]] = {}
     terms: dict[str, str] = {}
