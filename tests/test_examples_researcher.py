@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.mark.slow
 def test_the_commands_make_a_shader(tmp_path: Path) -> None:
-    shutil.copytree(ROOT / "models/ao/balanced", tmp_path / "models/ao/balanced")
+    shutil.copytree(ROOT / "models/ao/fast", tmp_path / "models/ao/fast")
     command = [sys.executable, str(ROOT / "examples/researcher.py"), "--small"]
     # elsewhere, so what PYTHONPATH names by relative paths must be found there too
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}

@@ -19,10 +19,10 @@ from deepshade.tensors import channel_slices, up
 from deepshade.timing import Pace, alternate
 
 WIDTH, HEIGHT = 768, 512  # the paper's frame
-_PACE = Pace(0.0, min_rounds=9)
+_ROUNDS, _QUICK_ROUNDS = 9, 2
 
 
-def milliseconds(bundle: Bundle) -> dict[str, float]:
+def milliseconds(bundle: Bundle, rounds: int = _ROUNDS) -> dict[str, float]:
     """Median milliseconds of the bare network at 768 x 512, by backend; all take turns.
 
     All three runs of a network that runs once a colour channel. Input is ready, and noise. Timed as
@@ -33,7 +33,7 @@ def milliseconds(bundle: Bundle) -> dict[str, float]:
     engines = {str(b): load_engine(bundle, b, threads=cpu_count()) for b in usable(bundle)}
     given = (black(bundle.environment),) if bundle.environment else ()
     tasks = {name: partial(engine.predict, gbuffer, *given) for name, engine in engines.items()}
-    times = alternate(tasks, _PACE)
+    times = alternate(tasks, Pace(0.0, min_rounds=rounds))
     return {name: round(median(found["ms"]), 2) for name, found in times.items()}
 
 
@@ -51,6 +51,7 @@ def bench(
         list[Path] | None,
         typer.Option(help="Folder of bundles; repeatable. Default: as 'deepshade serve'."),
     ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Two rounds instead of nine.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Time every bundle on every engine and precision here; * is what a request gets.
@@ -63,10 +64,11 @@ def bench(
 
     from deepshade.console import stdout
 
+    rounds = _QUICK_ROUNDS if quick else _ROUNDS
     rows: list[dict[str, Any]] = []
     for bundle in map(Bundle.load, bundle_folders(*bundle_roots(models or ()))):
         chosen = str(choose(bundle))
-        for backend, ms in milliseconds(bundle).items():
+        for backend, ms in milliseconds(bundle, rounds).items():
             name = f"{bundle.effect}/{bundle.name}"
             rows.append({"bundle": name, "backend": backend, "ms": ms, "chosen": backend == chosen})
     if json:

@@ -346,6 +346,20 @@ def test_map_kd_is_read_by_coordinates_from_below(tmp_path: Path) -> None:
     assert texels[row, column, :3] == pytest.approx(np.tile(linear(RED), (3, 1)), rel=2e-3)
 
 
+@pytest.mark.parametrize(("mask", "left"), [((255, 255, 255), 1), ((0, 0, 0), 0)])
+def test_map_d_cuts_out_by_a_file_of_its_own(tmp_path: Path, mask: Any, left: int) -> None:
+    (tmp_path / "leaf.png").write_bytes(png([[RED, RED], [RED, RED]]))
+    (tmp_path / "mask.png").write_bytes(png([[mask, GREY], [GREY, GREY]]))
+    for colour in ("map_Kd leaf.png\n", ""):
+        mtl = f"newmtl leaf\nKd 1 0 0\n{colour}map_d mask.png\nnewmtl other\nKd 1 1 1\n"
+        mesh = obj(tmp_path, "leaf", "other", mtl=mtl)
+        names = {item.name for item in mesh.objects if item.start < item.stop}
+        assert names == ({"leaf", "other"} if left else {"other"})
+        if left:
+            assert mesh.paint is not None
+            assert not mesh.paint.bitmaps[0].texels[..., 1:3].any()  # Kd's red
+
+
 def test_vertex_colours_of_a_ply(tmp_path: Path) -> None:
     import trimesh
 

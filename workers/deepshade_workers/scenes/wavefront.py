@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from deepshade_workers.scenes.bitmap import CLAMP, REPEAT, WHITE, Surface, roughness_of
+from deepshade_workers.scenes.bitmap import CLAMP, REPEAT, WHITE, Picture, Surface, roughness_of
 from deepshade_workers.scenes.gltf_material import HALF, MISSING
 from deepshade_workers.scenes.resources import Resources
 
@@ -71,8 +71,9 @@ def read_mtl(text: str, resources: Resources, used: Sequence[str]) -> dict[str, 
     """Surfaces of those materials of a library that are `used`, by name.
 
     Kd and map_Kd are the base colour, Ks and Ns reflectance and exponent of the highlight where
-    `illum` has one, d (or 1 - Tr) the opacity. Where Kd and Ks sum to more than 1 Ks is what Kd
-    leaves: no surface reflects more light than it gets.
+    `illum` has one, d (or 1 - Tr) the opacity, times map_d: its alpha, or without one its grey,
+    unless it is map_Kd's own file, whose alpha counts anyway. Where Kd and Ks sum to more than 1
+    Ks is what Kd leaves: no surface reflects more light than it gets.
     """
     found: dict[str, dict[str, str]] = {}
     terms: dict[str, str] = {}
@@ -95,6 +96,9 @@ def _surface(terms: Mapping[str, str], resources: Resources) -> Surface:
         if options.get("-clamp") == "on":
             wrap = (CLAMP, CLAMP)
     base = _colour(terms.get("kd"), WHITE if picture else MISSING)
+    shape = _texture(terms.get("map_d", ""))[1]
+    if shape and shape != _texture(named or "")[1] and (mask := resources.picture(shape)):
+        picture = _masked(picture, mask)
     specular = _colour(terms.get("ks"), (0.0, 0.0, 0.0))
     if terms.get("illum", "2") not in SHINY:
         specular = (0.0, 0.0, 0.0)
@@ -109,6 +113,19 @@ def _surface(terms: Mapping[str, str], resources: Resources) -> Surface:
         cutoff=HALF if alpha < 1 or "map_d" in terms else None,
         wrap=wrap,
     )
+
+
+def _masked(picture: Picture | None, mask: Picture) -> Picture:
+    """The picture, or white, with the alpha of the mask, which without one is its grey."""
+    from PIL import Image
+
+    image = mask.image()
+    alpha = image.getchannel("A")
+    if alpha.getextrema() == (255, 255):
+        alpha = image.convert("L")
+    found = picture.image().copy() if picture else Image.new("RGBA", image.size, "white")
+    found.putalpha(alpha.resize(found.size))
+    return Picture.of(found)
 
 
 def _libraries(line: str, folder: Path) -> list[str]:
