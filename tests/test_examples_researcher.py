@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # about a minute of one core; Ray, Mitsuba and PyTorch start in it
 def test_the_commands_make_a_shader(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "models/ao/fast", tmp_path / "models/ao/fast")
     command = [sys.executable, str(ROOT / "examples/researcher.py"), "--small"]

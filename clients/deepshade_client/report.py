@@ -223,7 +223,7 @@ def _entry(task: Task, result: Result | None) -> dict[str, Any]:
 
 def number(name: str, fact: str) -> str | int | float:
     """A header's number as one; names and hashes stay text, whatever they look like."""
-    if name.endswith(("bundle", "environment", "sha256")):
+    if name.endswith(("bundle", "environment", "sha256", "layer")):
         return fact
     for kind in (int, float):
         with suppress(ValueError):

@@ -152,17 +152,17 @@ def bundle_roots(named: Sequence[Path | str] = ()) -> tuple[Path, ...]:
     return tuple(dict.fromkeys(roots))
 
 
+def bundle_root() -> Path:
+    """The first of the folders of models, by default the shipped one."""
+    return bundle_roots()[0]
+
+
 def overlooked(roots: Sequence[Path]) -> str:
     """What to tell people who keep bundles in ./models and didn't name it; "" where they don't."""
     here = Path("models")
     if any(root.resolve() == here.resolve() for root in roots) or not bundle_folders(here):
         return ""
     return f"the bundles in ./models aren't used; --models models --models {SHIPPED} uses them too"
-
-
-def bundle_root() -> Path:
-    """The first of them."""
-    return bundle_roots()[0]
 
 
 def bundle_folders(*roots: Path | str) -> list[Path]:

@@ -152,6 +152,7 @@ def test_shade_a_folder_as_json(run, views, tmp_path):
         ("bundle_sha256", "123456789012", "123456789012"),
         ("ao.bundle", "7", "7"),
         ("environment", "2024", "2024"),
+        ("layer", "001", "001"),
         ("dssim", "nan", "nan"),
         ("derived", "position from depth", "position from depth"),
     ],

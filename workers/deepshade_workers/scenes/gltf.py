@@ -6,9 +6,9 @@ has them; animations are not played.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from deepshade.errors import SceneError
 from deepshade_workers.scenes.bitmap import BARE
 from deepshade_workers.scenes.cutouts import cut
+from deepshade_workers.scenes.gltf_document import Document, open_document
 from deepshade_workers.scenes.gltf_material import Texturing, surface_of
 from deepshade_workers.scenes.mesh import Floats, Mesh, Paint, merge
-from deepshade_workers.scenes.resources import Resources
 
 # Extensions that are read, or that change nothing of what is rendered.
 KNOWN = {
@@ -46,83 +46,7 @@ CURES = {
     "KHR_texture_basisu": "export it with PNG or JPEG textures",
     "EXT_mesh_gpu_instancing": "export it with each instance as a node of its own",
 }
-TYPES: dict[int, Any] = {
-    5120: np.int8,
-    5121: np.uint8,
-    5122: np.int16,
-    5123: np.uint16,
-    5125: np.uint32,
-    5126: np.float32,
-}
-SHAPES: dict[str, tuple[int, ...]] = {
-    "SCALAR": (),
-    "VEC2": (2,),
-    "VEC3": (3,),
-    "VEC4": (4,),
-    "MAT4": (4, 4),
-}
 TRIANGLES, STRIP, FAN = 4, 5, 6
-
-
-@dataclass
-class Document:
-    """An open file: its JSON, its buffers, and the `resources` beside it."""
-
-    json: Mapping[str, Any]
-    resources: Resources
-    binary: bytes = b""
-    buffers: dict[int, bytes] = field(default_factory=dict)
-    surfaces: dict[int, Texturing] = field(default_factory=dict)
-
-    def view(self, index: int) -> tuple[bytes, Mapping[str, Any]]:
-        """The bytes of a buffer view, and what else is said of it."""
-        view = self.json["bufferViews"][index]
-        number = view["buffer"]
-        if number not in self.buffers:
-            uri = self.json["buffers"][number].get("uri")
-            self.buffers[number] = self.binary if uri is None else self.resources.read(uri)
-        start = view.get("byteOffset", 0)
-        found = self.buffers[number][start : start + view["byteLength"]]
-        if len(found) < view["byteLength"]:
-            raise ValueError(f"its buffer {number} is too short")
-        return found, view
-
-    def accessor(self, index: int) -> NDArray[Any]:
-        """The values of an accessor, (count, …): floats where they are normalised integers."""
-        accessor = self.json["accessors"][index]
-        kind = np.dtype(TYPES[accessor["componentType"]]).newbyteorder("<")
-        count, shape = accessor["count"], SHAPES[accessor["type"]]
-        if "bufferView" in accessor:
-            data, view = self.view(accessor["bufferView"])
-            start = accessor.get("byteOffset", 0)
-            values = _strided(data, start, view.get("byteStride"), count, shape, kind)
-        else:
-            values = np.zeros((count, *shape), kind)
-        if "sparse" in accessor:
-            values = self._replaced(values, accessor["sparse"])
-        if accessor.get("normalized"):
-            return np.maximum(values.astype(np.float64) / np.iinfo(kind).max, -1)
-        return values
-
-    def _replaced(self, values: NDArray[Any], sparse: Mapping[str, Any]) -> NDArray[Any]:
-        where, what = sparse["indices"], sparse["values"]
-        count = sparse["count"]
-        places, _ = self.view(where["bufferView"])
-        kind = np.dtype(TYPES[where["componentType"]]).newbyteorder("<")
-        rows = _strided(places, where.get("byteOffset", 0), None, count, (), kind)
-        data, _ = self.view(what["bufferView"])
-        found = values.copy()
-        start = what.get("byteOffset", 0)
-        found[rows] = _strided(data, start, None, count, values.shape[1:], values.dtype)
-        return found
-
-    def surface(self, index: int | None) -> Texturing:
-        """Material `index`; None is the project's own default, for the file says nothing."""
-        if index is None:
-            return Texturing(None)
-        if index not in self.surfaces:
-            self.surfaces[index] = surface_of(self, self.json["materials"][index])
-        return self.surfaces[index]
 
 
 def load_gltf(path: Path) -> Mesh:
@@ -132,7 +56,7 @@ def load_gltf(path: Path) -> Mesh:
         SceneError: it needs an extension that can't be read.
         OSError, ValueError, KeyError, IndexError: it is damaged, or a buffer is missing.
     """
-    document = _open(path)
+    document = open_document(path)
     content = document.json
     if not isinstance(content, dict):
         raise ValueError("it is no glTF")
@@ -148,6 +72,14 @@ def load_gltf(path: Path) -> Mesh:
     for name in content.get("extensionsUsed", ()):
         if name not in KNOWN and name in CURES and name.startswith("EXT_mesh_gpu"):
             document.resources.note(f"its {name} can't be read: {CURES[name]}")
+
+    @functools.cache
+    def surface(index: int | None) -> Texturing:
+        """Material `index`; None is the project's own default, for the file says nothing."""
+        return (
+            Texturing(None) if index is None else surface_of(document, content["materials"][index])
+        )
+
     worlds = _worlds(content.get("nodes", []))
     parts, names = [], []
     taken: set[str] = set()
@@ -162,7 +94,7 @@ def load_gltf(path: Path) -> Mesh:
             name = f"{base}_{count}"
         taken.add(name)
         for primitive in content["meshes"][node["mesh"]]["primitives"]:
-            part = _primitive(document, node, primitive, worlds, index)
+            part = _primitive(document, node, primitive, worlds, index, surface)
             if part is not None and len(part.faces):
                 parts.append(part)
                 names.append(name)
@@ -170,39 +102,6 @@ def load_gltf(path: Path) -> Mesh:
         raise SceneError(f"{path} holds no triangles")
     merged = merge(parts, names)
     return replace(merged, notes=tuple(document.resources.notes))
-
-
-def _open(path: Path) -> Document:
-    data = path.read_bytes()
-    resources = Resources(path)
-    if data[:4] != b"glTF":
-        return Document(json.loads(data.decode("utf-8-sig")), resources)
-    if int.from_bytes(data[4:8], "little") == 1:
-        raise SceneError(f"{path} is glTF 1", fix="only glTF 2 can be read: export it anew")
-    chunks: dict[bytes, bytes] = {}
-    start = 12
-    while start + 8 <= len(data):
-        length = int.from_bytes(data[start : start + 4], "little")
-        chunk = data[start + 8 : start + 8 + length]
-        if len(chunk) < length:
-            raise ValueError("it ends too early")
-        chunks.setdefault(data[start + 4 : start + 8], chunk)
-        start += 8 + length
-    if b"JSON" not in chunks:
-        raise ValueError("it is no GLB")
-    return Document(json.loads(chunks[b"JSON"]), resources, chunks.get(b"BIN\0", b""))
-
-
-def _strided(
-    data: bytes, start: int, stride: int | None, count: int, shape: tuple[int, ...], kind: Any
-) -> NDArray[Any]:
-    """(count, *shape) elements, `stride` bytes apart; ValueError beyond the data's end."""
-    kind = np.dtype(kind)
-    inner = [kind.itemsize * int(np.prod(shape[axis + 1 :])) for axis in range(len(shape))]
-    step = stride or kind.itemsize * int(np.prod(shape))
-    found: NDArray[Any] = np.ndarray((count, *shape), kind, data, start, (step, *inner))
-    # matrices are stored by columns
-    return found.swapaxes(1, 2) if len(shape) == 2 else found
 
 
 def _local(node: Mapping[str, Any]) -> Floats:
@@ -262,6 +161,7 @@ def _primitive(
     primitive: Mapping[str, Any],
     worlds: list[Floats],
     index: int,
+    surface_at: Callable[[int | None], Texturing],
 ) -> Mesh | None:
     """One primitive in the world; None where it holds points or lines."""
     attributes = primitive["attributes"]
@@ -285,7 +185,7 @@ def _primitive(
         matrix = np.eye(4)
     if np.linalg.det(matrix[:3, :3]) == 0:
         return None  # squashed flat: some exporters hide things so
-    texturing = document.surface(primitive.get("material"))
+    texturing = surface_at(primitive.get("material"))
     paint = _paint(texturing, arrays, faces)
     material = None if texturing.surface is None else texturing.surface.material
     mesh = Mesh.of_file(vertices, faces, normals, material=material, paint=paint)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -17,24 +17,14 @@ from deepshade_workers.scenes.bitmap import (
     Picture,
     Surface,
 )
+from deepshade_workers.scenes.gltf_document import Document
 from deepshade_workers.scenes.mesh import Floats
-from deepshade_workers.scenes.resources import Resources
 
 WRAPS = {10497: REPEAT, 33648: MIRROR, 33071: CLAMP}
 NEAREST = 9728
 # What lets more than half of the light through is taken for absent: a pixel has one surface.
 HALF = 0.5
 MISSING = (0.7, 0.7, 0.7)
-
-
-class Source(Protocol):
-    """The parts of `gltf.Document` that materials need."""
-
-    json: Mapping[str, Any]
-    resources: Resources
-
-    def view(self, index: int) -> tuple[bytes, Mapping[str, Any]]:
-        """The bytes of a buffer view, and what else is said of it."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +39,7 @@ class Texturing:
     transform: Floats = field(default_factory=lambda: np.eye(2, 3))
 
 
-def surface_of(source: Source, material: Mapping[str, Any]) -> Texturing:
+def surface_of(source: Document, material: Mapping[str, Any]) -> Texturing:
     """What `material` says; pictures that can't be had are noted and left out."""
     extensions = material.get("extensions", {})
     if gloss := extensions.get("KHR_materials_pbrSpecularGlossiness"):
@@ -125,7 +115,7 @@ def _cutoff(material: Mapping[str, Any], extensions: Mapping[str, Any]) -> float
     return HALF if mode == "BLEND" or through else None
 
 
-def _picture(source: Source, info: Mapping[str, Any] | None) -> Picture | None:
+def _picture(source: Document, info: Mapping[str, Any] | None) -> Picture | None:
     """The image of a texture, WebP ones too; None where there is none or it can't be had."""
     if info is None:
         return None
@@ -144,7 +134,7 @@ def _picture(source: Source, info: Mapping[str, Any] | None) -> Picture | None:
     return source.resources.checked(image.get("name") or f"image {index}", data)
 
 
-def _sampler(source: Source, info: Mapping[str, Any] | None) -> Mapping[str, Any]:
+def _sampler(source: Document, info: Mapping[str, Any] | None) -> Mapping[str, Any]:
     texture = source.json["textures"][info["index"]] if info else {}
     found: Mapping[str, Any] = {}
     if "sampler" in texture:
