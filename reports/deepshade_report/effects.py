@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -206,7 +207,9 @@ def write(
     for name in dict.fromkeys(name for name in marked if name in EFFECTS):
         try:
             context = context_of(name)
-            report: dict[str, Any] = measure(context, only=("error", "speed"), resume=resume)
+            report: dict[str, Any] = measure(
+                context, only=("error", "speed"), resume=resume, progress=partial(_tell, name)
+            )
             found[name] = figures = Figures(report["sections"])
             made[name] = fragment(context, figures, documents[0].parent / "images" / "effects")
             if not context.quick:
@@ -220,6 +223,10 @@ def write(
         with replacing(document) as part:
             part.write_text(_MARKED.sub(lambda m: m[1] + made.get(m[2], "") + m[3], text), "utf-8")
     return wrong
+
+
+def _tell(effect: str, section: str, share: float, doing: str) -> None:
+    print(f"{effect} {section} {share:4.0%} {doing}", flush=True)
 
 
 def _to_cards(context: Context, found: Figures) -> None:
@@ -273,7 +280,6 @@ def main() -> None:
             asked.threads,
             asked.quick,
             asked.views,
-            advance=lambda share, doing: print(f"{effect} {share:4.0%} {doing}", flush=True),
         )
 
     for effect, why in write(asked.document, context_of, resume=asked.resume).items():
