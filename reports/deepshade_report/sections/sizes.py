@@ -52,7 +52,7 @@ def sizes(context: Context) -> dict[str, Any]:
 def _shaded(
     context: Context, folder: Path, shapes: Iterable[Shape], memory: str | None = None
 ) -> list[dict[str, Any]]:
-    path = f"/shade/{context.effect}?bundle={context.served[0].name}"
+    path = f"/shade/{context.effect}?bundle={context.served[0].name}&trust=1"
     with Server(context.models, ("--memory", memory) if memory else ()) as server:
         server.shade(path, (folder / _text(_USUAL)).read_bytes())
         idle = server.settle(1.0 if context.quick else 3.0)
