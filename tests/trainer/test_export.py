@@ -130,13 +130,14 @@ def test_the_shipped_bundles_are_what_torch_computes(name: str) -> None:
 
 
 def test_a_shipped_network_exports_as_it_was(tmp_path: Path) -> None:
-    """The same marks for float32, no more memory, the same answer, and weights by name."""
+    """The same marks for float32, a little less memory, the same answer, and weights by name."""
     bundle = Bundle.load(bundle_root() / "ao" / "fast")
     shader = from_bundle(bundle.path)
     graph = write_onnx(shader, tmp_path / "model.onnx")
     float32, after = float32_marks(graph, shader.network.rounded)
     assert (len(float32), after) == (len(bundle.float32), [])
-    assert bytes_per_pixel(graph, INPUT, (6, 256, 256)) <= bundle.bytes_per_pixel
+    # shipped graphs still choose by If, and hold a plane or two for that
+    assert 0 <= bundle.bytes_per_pixel - bytes_per_pixel(graph, INPUT, (6, 256, 256)) <= 3
     names = {tensor.name for tensor in graph.graph.initializer}
     assert names >= shader.network.state_dict().keys()
     gbuffer = torch.randn(1, 6, 64, 96, generator=torch.Generator().manual_seed(0))

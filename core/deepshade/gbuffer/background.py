@@ -165,3 +165,4 @@ _EMPTY: dict[str, Callable[[Array, Mask], None]] = {
     "normal_world": _vector,
     "position_world": _vector,
 }
+SURFACE = frozenset(_EMPTY) - {"alpha"}  # quantities that are 0 where there is no surface

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from deepshade.camera import Camera, rotation_of
 from deepshade.errors import ContradictionError
 from deepshade.gbuffer.axes import AS_STORED, EVERY, Axes
-from deepshade.gbuffer.background import DEPTHS, FAR
+from deepshade.gbuffer.background import DEPTHS, FAR, SURFACE
 from deepshade.gbuffer.conventions import NORMALS, Conventions, Reading
 from deepshade.gbuffer.depths import MEANINGS, Kind
 from deepshade.gbuffer.pairs import CENTRES, Pairs, misfits, projection, slopes_between
@@ -32,8 +32,6 @@ _GOOD = _ALIKE  # misfit that no other reading can be so much better than
 _UNLIKELY = 0.6  # misfit of surfaces and normals that have little to do with each other
 _LENGTH = 0.1  # by how much a normal may be too short or too long, in the median
 _MOST, _FEW = 0.9, 0.1
-# Zero where there is no surface; elsewhere black, at rest or in focus is zero too.
-_SURFACE = {*DEPTHS, "position", "position_world", "normal", "normal_world"}
 _SEEN = 0.7  # share of normals that face the camera where they are interpolated, or bumpy
 
 
@@ -157,7 +155,7 @@ class _Examination:
             for name, shown in self.shown.items()
             if name != "alpha"
         }
-        telling = _SURFACE & share.keys()
+        telling = SURFACE & share.keys()
         if not telling or not self.pairs.count:
             return False
         fullest = max(sorted(telling), key=lambda name: share[name])
@@ -411,7 +409,7 @@ def _shown(name: str, stored: Array) -> Mask:
         return np.asarray(finite & (stored[0] != 0) & (np.abs(stored[0]) < FAR))
     if name == "position":
         return np.asarray(finite & (stored[2] != 0) & (np.abs(stored[2]) < FAR))
-    if name not in _SURFACE:
+    if name not in SURFACE:  # black, at rest and in focus are 0 too
         return np.asarray(finite)
     return np.asarray(finite & (stored != 0).any(0))
 
