@@ -33,8 +33,8 @@ def test_the_card_is_of_the_figures(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "machine"),
     [
-        ("two Xeon cores with AMX", "Intel(R) Xeon(R) Processor, 2 CPUs"),
-        ("two EPYC cores (Zen 4, 16-bit products)", "AMD EPYC, 2 CPUs"),
+        ("two Xeon cores with AMX", "Intel(R) Xeon(R) Processor (AMX), 2 CPUs"),
+        ("two EPYC cores (Zen 4, 16-bit products)", "AMD EPYC (AVX-512), 2 CPUs"),
     ],
 )
 def test_readme_says_what_the_cards_of_ao_say(row: str, machine: str) -> None:
