@@ -10,13 +10,12 @@ time it took; the first that fails ends it.
 from __future__ import annotations
 
 import argparse
-import re
 import shlex
 import sys
 import time
-from pathlib import Path
 
-README = Path(__file__).resolve().parent.parent / "README.md"
+from walk import block, lines
+
 # In small: the lightest bundle in place of the balanced one, and of an option that is given twice
 # the last counts.
 SMALL = {
@@ -28,15 +27,13 @@ SMALL = {
 }
 
 
-def commands(document: str, heading: str) -> list[list[str]]:
-    """The `deepshade` commands of the first shell block under a heading, as lists of words."""
-    block = re.search(rf"^## {heading}$.*?^```sh\n(.*?)^```", document, re.DOTALL | re.MULTILINE)
-    if block is None:
-        raise ValueError(f"no shell block under {heading!r}")
-    lines = block[1].replace("\\\n", " ").splitlines()
-    return [
-        words for line in lines if (words := shlex.split(line, comments=True))[:1] == ["deepshade"]
+def commands() -> list[list[str]]:
+    """README's, but for the first, which installs: as lists of words."""
+    found = [
+        shlex.split(line, comments=True)
+        for line in lines(block("README.md", "Making your own shader"))
     ]
+    return [words for words in found if words[0] == "deepshade"]
 
 
 def main() -> int:
@@ -47,7 +44,7 @@ def main() -> int:
 
     from deepshade.cli import main as deepshade
 
-    for words in commands(README.read_text("utf-8"), "Making your own shader"):
+    for words in commands():
         if options.small:
             words = [word.replace("ao/balanced", "ao/fast") for word in words]
             words += SMALL.get(words[1], "").split()

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import re
 import signal
+import subprocess
+import sys
 import tempfile
+import venv
+from collections.abc import Callable
+from importlib.metadata import distribution
 from pathlib import Path
+from typing import Any
 
 import pytest
+from filelock import FileLock
+from packaging.requirements import Requirement
 
 # A shell's background job ignores Ctrl-C, and so would every command that a test interrupts.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -37,3 +47,77 @@ def shared() -> Path:
     if not (folder / "scenes").is_dir():
         pytest.skip(f"real scenes are not at {folder}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def wheel(made_once: Path) -> Path:
+    """The wheel of this tree."""
+    made_once.mkdir(exist_ok=True)
+    with FileLock(made_once / "wheel.lock"):
+        if not (found := list(made_once.glob("*.whl"))):
+            build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d"]
+            subprocess.run([*build, str(made_once)], cwd=ROOT, check=True, capture_output=True)
+            found = list(made_once.glob("*.whl"))
+    return found[0]
+
+
+@pytest.fixture(scope="session")
+def environment() -> Callable[..., Path]:
+    """`environment(folder, "numpy", …)`: a virtual environment with these packages; its `bin`.
+
+    And with what they require, by the metadata, but nothing else. All are links to what is
+    installed here, which takes neither the network nor time. Of deepshade only what it requires is
+    there, and the `wheel`: pip finds out whether that demands more.
+    """
+
+    def make(folder: Path, *packages: str, wheel: Path | None = None) -> Path:
+        venv.create(folder)
+        (site,) = folder.glob("lib/python*/site-packages")
+        for place in sorted(_places(packages)):
+            (site / place.name).symlink_to(place)
+        if wheel:
+            pip = [sys.executable, "-m", "pip", "--python", str(folder), "install", "-q"]
+            subprocess.run([*pip, "--no-index", str(wheel)], check=True)
+        return folder / "bin"
+
+    return make
+
+
+def _places(packages: tuple[str, ...]) -> set[Path]:
+    """The folders and modules of packages and all that they require."""
+    todo, seen, found = [Requirement(name) for name in packages], set[str](), set[Path]()
+    while todo:
+        wanted = todo.pop()
+        if str(wanted) in seen:
+            continue
+        seen.add(str(wanted))
+        package = distribution(wanted.name)
+        for needed in map(Requirement, package.requires or ()):
+            extras = ("", *wanted.extras)
+            if not needed.marker or any(needed.marker.evaluate({"extra": e}) for e in extras):
+                todo.append(needed)
+        if wanted.name != "deepshade":
+            tops = {file.parts[0] for file in package.files or ()} - {"..", "__pycache__"}
+            found |= {Path(str(package.locate_file(top))) for top in tops}
+    return found
+
+
+@pytest.fixture(scope="session")
+def walk() -> Any:
+    """`examples/walk.py`, which runs documents' blocks."""
+    spec = importlib.util.spec_from_file_location("walk", ROOT / "examples" / "walk.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No variable leads to the repository, or pip to the network."""
+    for name in list(os.environ):
+        if re.fullmatch(r"PYTHONPATH|VIRTUAL_ENV|RAY_ADDRESS|(DEEPSHADE|PIP)_.*", name):
+            monkeypatch.delenv(name)
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_DISABLE_PIP_VERSION_CHECK", "1")

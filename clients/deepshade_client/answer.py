@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade import exr
+from deepshade import exr, pictures
 from deepshade.errors import ImageError
 from deepshade.files import replacing
 from deepshade_client.exceptions import BadAnswer
 
 _PREFIX = "deepshade-"
+PNG = b"\x89PNG"  # how such a file begins
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -53,19 +54,15 @@ class Answer:
         return target
 
     def plan(self) -> dict[str, Any]:
-        """How it was made, and why, as the EXR's header says; {} if it doesn't (as in a PNG).
+        """How it was made, and why, as the file's header says; {} if it doesn't.
 
         The same as `Client.explain` gives: for several effects a plan for each. Raises
         BadAnswer when the file is damaged.
         """
-        if self.media_type != "image/x-exr":
-            return {}
         try:
-            part = exr.read_header(self.content).parts[0]
-            plan = json.loads(part.attributes.get("deepshade:plan", "{}"))
+            return plan_in(self.content)
         except (ImageError, ValueError) as error:
             raise BadAnswer(f"the answer's header can't be read: {error}") from error
-        return plan if isinstance(plan, dict) else {}
 
     def channels(self) -> dict[str, NDArray[np.float32]]:
         """The decoded EXR: (H, W) float32 under "Y", or "R", "G" and "B".
@@ -106,6 +103,20 @@ class Saved:
     media_type: str
     facts: Mapping[str, str]
     timing: Mapping[str, float]
+
+
+def plan_in(content: bytes) -> dict[str, Any]:
+    """The plan in an answer's bytes, EXR or PNG; {} where there is none.
+
+    Raises ImageError or ValueError for a damaged file.
+    """
+    entries: Mapping[str, Any]
+    if content.startswith(PNG):
+        entries = pictures.texts_of(content)
+    else:
+        entries = exr.read_header(content).parts[0].attributes
+    plan = json.loads(entries.get("deepshade:plan", "{}"))
+    return plan if isinstance(plan, dict) else {}
 
 
 def facts(headers: Mapping[str, str]) -> dict[str, str]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from deepshade import exr
 from deepshade.errors import ImageError, LimitError
 from deepshade_client import sequences
-from deepshade_client.answer import Saved
+from deepshade_client.answer import PNG, Saved, plan_in
 from deepshade_client.client import AsyncClient
 from deepshade_client.exceptions import ClientError, ConnectionFailed
 from deepshade_client.request import Options
@@ -128,7 +128,7 @@ def is_done(task: Task) -> bool:
             return False
         content = task.target.read_bytes()
         if task.target.suffix.lower() == ".png":
-            return content.startswith(b"\x89PNG") and content.endswith(b"IEND\xaeB`\x82")
+            return content.startswith(PNG) and content.endswith(b"IEND\xaeB`\x82")
         exr.read_header(content)
     except (OSError, ImageError, LimitError):
         return False
@@ -213,9 +213,14 @@ async def run(
 
 def _radius_of(answer: Path) -> str | None:
     """As `_radius_among`, of a saved answer; None where that doesn't tell."""
-    if answer.suffix.lower() != ".exr":
-        return None
-    return _radius_among(exr.read_header(answer).parts[0].attributes, ":")
+    content = answer.read_bytes()
+    if content.startswith(PNG):  # which holds one effect
+        try:
+            plan = plan_in(content)
+        except ValueError:
+            plan = {}
+        return _radius_among(plan, ".") if plan else None
+    return _radius_among(exr.read_header(content).parts[0].attributes, ":")
 
 
 def _radius_among(facts: Mapping[str, object], between: str) -> str:

@@ -38,15 +38,16 @@ class Client:
     """Talks to one service; may be shared by threads. Use it as a context manager, or `close` it.
 
     `server` defaults to $DEEPSHADE_SERVER, else http://127.0.0.1:8000. `transport` replaces the
-    network (see `MockTransport`). `waiting` hears of an error, and of the seconds until the next
-    attempt, each time that one follows. Every method raises ClientError.
+    network (see `MockTransport`). A number as `timeout` is the seconds until the answer. `waiting`
+    hears of an error, and of the seconds until the next attempt, each time that one follows. Every
+    method raises ClientError.
     """
 
     def __init__(
         self,
         server: str | None = None,
         *,
-        timeout: Timeout | None = None,
+        timeout: Timeout | float | None = None,
         retry: Retry | None = None,
         transport: httpx.BaseTransport | None = None,
         waiting: Waiting | None = None,
@@ -56,7 +57,7 @@ class Client:
         self._waiting = waiting or (lambda error, seconds: None)
         self._http = httpx.Client(
             base_url=base_url(self.server),
-            timeout=(timeout or Timeout()).as_httpx(),
+            timeout=Timeout.of(timeout).as_httpx(),
             transport=transport,
         )
 
@@ -165,7 +166,7 @@ class AsyncClient:
         self,
         server: str | None = None,
         *,
-        timeout: Timeout | None = None,
+        timeout: Timeout | float | None = None,
         retry: Retry | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
         waiting: Waiting | None = None,
@@ -175,7 +176,7 @@ class AsyncClient:
         self._waiting = waiting or (lambda error, seconds: None)
         self._http = httpx.AsyncClient(
             base_url=base_url(self.server),
-            timeout=(timeout or Timeout()).as_httpx(),
+            timeout=Timeout.of(timeout).as_httpx(),
             transport=transport,
         )
 

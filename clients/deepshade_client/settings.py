@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import random
 from dataclasses import dataclass
@@ -37,6 +38,18 @@ class Timeout:
     connect: float = 5.0
     send: float = 60.0
     answer: float = 600.0
+
+    @classmethod
+    def of(cls, given: Timeout | float | None) -> Timeout:
+        """Itself; a number is the seconds until the answer; None are the defaults.
+
+        Raises ClientError for what is neither.
+        """
+        if given is None or isinstance(given, Timeout):
+            return given or cls()
+        if not (isinstance(given, int | float) and 0 < given < math.inf):
+            raise ClientError(f"a timeout is seconds above 0 or a Timeout, not {given!r}")
+        return cls(answer=given)
 
     def as_httpx(self) -> httpx.Timeout:
         """The same for httpx."""

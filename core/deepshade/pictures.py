@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+import struct
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -68,14 +69,32 @@ def below(rows: Sequence[Picture]) -> Picture:
     return _joined(rows, axis=0)
 
 
-def png(picture: Picture) -> bytes:
-    """The bytes of a PNG file; grey pictures have one channel."""
+def png(picture: Picture, texts: Mapping[str, str] | None = None) -> bytes:
+    """The bytes of a PNG file; grey pictures have one channel. `texts` (ASCII) go in by keyword."""
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
+    info = PngInfo()
+    for keyword, text in (texts or {}).items():
+        info.add_text(keyword, text)
     grey = (picture == picture[..., :1]).all()
     buffer = io.BytesIO()
-    Image.fromarray(picture[..., 0] if grey else picture).save(buffer, "PNG", compress_level=3)
+    Image.fromarray(picture[..., 0] if grey else picture).save(
+        buffer, "PNG", compress_level=3, pnginfo=info
+    )
     return buffer.getvalue()
+
+
+def texts_of(content: bytes) -> dict[str, str]:
+    """The texts of a PNG file (its tEXt chunks), as `png` writes them; needs no Pillow."""
+    found, at = {}, 8
+    while at + 8 <= len(content):
+        length, kind = struct.unpack_from(">I4s", content, at)
+        if kind == b"tEXt":
+            keyword, _, text = content[at + 8 : at + 8 + length].partition(b"\0")
+            found[keyword.decode("latin-1")] = text.decode("latin-1")
+        at += 12 + length
+    return found
 
 
 def save(path: Path, picture: Picture) -> None:

@@ -1,6 +1,6 @@
 """Ambient occlusion of an OpenEXR G-buffer by ONNX Runtime: normals in camera space and Z.
 
-python shade.py models/ao/fast/model.onnx samples/room.exr ao.exr RADIUS FOV
+python shade.py models/ao/fast/model.onnx samples/room.exr ao.exr RADIUS FOV [gbuffer.f32]
 """
 
 import sys
@@ -23,6 +23,8 @@ y = (height / 2 - np.arange(height) - 0.5)[:, None] * step  # up
 gbuffer = np.stack([*normal, x * depth / radius, y * depth / radius, -depth / radius])
 gbuffer[:, ~((depth > 0) & (depth < 1e10))] = 0  # background: six zeros
 gbuffer = np.pad(gbuffer, ((0, 0), (0, -height % 64), (0, -width % 64)))  # and past the picture
+if sys.argv[6:]:  # for the programs in C++
+    gbuffer.astype(np.float32).tofile(sys.argv[6])
 session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
 (shade,) = session.run(["shade"], {"gbuffer": gbuffer[None].astype(np.float32)})
 OpenEXR.File({}, {"Y": shade[0, 0, :height, :width].copy()}).write(target)

@@ -18,8 +18,11 @@ def report(
         ),
     ] = None,
     models: Annotated[
-        Path | None,
-        typer.Option(help="Folder of bundles, <effect>/<name>/. Default: as 'deepshade serve'."),
+        list[Path] | None,
+        typer.Option(
+            help="Folder of bundles, <effect>/<name>/, or 'shipped'; repeatable, the first "
+            "counts. Default: as 'deepshade serve'."
+        ),
     ] = None,
     paper: Annotated[
         Path | None,
@@ -53,7 +56,7 @@ def report(
     from rich.console import Console
     from rich.progress import Progress, TextColumn
 
-    from deepshade.bundles import bundle_root
+    from deepshade.bundles import bundle_roots
     from deepshade.effects import EFFECTS
     from deepshade.errors import ConfigError, DataError
     from deepshade.files import shipped
@@ -68,8 +71,8 @@ def report(
     if effect not in EFFECTS:
         raise ConfigError(effect, EFFECTS, detail=f"no effect is called '{effect}'")
     threads = threads or cpu_count()
-    models, data = models or bundle_root(), data or shipped("samples")
-    context = Context(models, data, out, paper, effect, threads, quick, views)
+    roots, data = bundle_roots(models or ()), data or shipped("samples")
+    context = Context(roots, data, out, paper, effect, threads, quick, views)
     console = Console(stderr=True)
     columns = (*Progress.get_default_columns(), TextColumn("{task.fields[doing]}"))
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:

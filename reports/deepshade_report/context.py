@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import distributions
@@ -30,11 +30,12 @@ _PACKAGES = ("deepshade", "numpy", "onnxruntime", "openvino", "OpenEXR", "mitsub
 class Context:
     """Settings of one report.
 
-    `max_views` is how many held-out views count at most. `advance(share, doing)` hears of progress.
-    `measured` are the sections that are done.
+    Of bundles in several of the folders `models` the first counts. `max_views` is how many held-out
+    views count at most. `advance(share, doing)` hears of progress. `measured` are the sections that
+    are done.
     """
 
-    models: Path
+    models: Sequence[Path]
     data: Path
     out: Path
     paper: Path | None = None
@@ -51,22 +52,24 @@ class Context:
 
         Raises BundleError for a damaged one.
         """
-        folders = [path for path in bundle_folders(self.models) if path.parent.name == self.effect]
+        folders = [path for path in bundle_folders(*self.models) if path.parent.name == self.effect]
         found = [Bundle.load(path) for path in folders if path.name != PAPER]
         if not found:
-            detail = f"{self.models} holds no bundle for '{self.effect}'"
+            places = ", ".join(map(str, self.models))
+            detail = f"no bundle for '{self.effect}' in {places}"
             raise ConfigError("models", detail=f"{detail}: train and export one, or set --models")
         rank = {name: index for index, name in enumerate(_QUALITIES)}
         return sorted(found, key=lambda bundle: (rank.get(bundle.name, len(rank)), bundle.name))
 
     @cached_property
     def paper_network(self) -> Bundle | None:
-        """The paper's network: what --paper names, else models/<effect>/paper, else None.
+        """The paper's network: what --paper names, else <models>/<effect>/paper, else None.
 
         Raises BundleError when the named folder holds none.
         """
-        folder = self.paper or self.models / self.effect / PAPER
-        return Bundle.load(folder) if self.paper or folder.is_dir() else None
+        places = [root / self.effect / PAPER for root in self.models]
+        folder = self.paper or next(filter(Path.is_dir, places), None)
+        return Bundle.load(folder) if folder else None
 
     @cached_property
     def views(self) -> list[View]:
@@ -90,8 +93,11 @@ class Context:
 
     def options(self) -> dict[str, Any]:
         """What was asked for, as JSON values."""
-        places = {"models": self.models, "data": self.data, "paper": self.paper}
-        asked: dict[str, Any] = {name: path and str(path) for name, path in places.items()}
+        asked: dict[str, Any] = {
+            "models": [str(path) for path in self.models],
+            "data": str(self.data),
+            "paper": self.paper and str(self.paper),
+        }
         asked |= {"effect": self.effect, "threads": self.threads}
         return asked | {"quick": self.quick, "views": self.max_views}
 

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from deepshade.bundles import bundle_root
+from deepshade.bundles import bundle_roots
 from deepshade.effects import EFFECTS
 from deepshade.errors import DataError, DeepshadeError
 from deepshade.files import replacing
@@ -253,7 +253,7 @@ def main() -> None:
         required=True,
         help="held-out views; of several sets an effect's are in the first that has its reference",
     )
-    parser.add_argument("--models", type=Path, default=bundle_root(), help="<effect>/<name>/")
+    parser.add_argument("--models", type=Path, action="append", help="<effect>/<name>/; repeatable")
     parser.add_argument("--paper", type=Path, help="<effect>/paper/ lie here (default: --models)")
     parser.add_argument(
         "--document",
@@ -272,7 +272,7 @@ def main() -> None:
     def context_of(effect: str) -> Context:
         paper = asked.paper / effect / PAPER if asked.paper else None
         return Context(
-            asked.models,
+            bundle_roots(asked.models or ()),
             data_of(effect, asked.data),
             asked.out / effect,
             paper if paper and paper.is_dir() else None,

@@ -56,12 +56,13 @@ class Server:
     `options` are those of `deepshade serve`. The standard library's client spends little CPU.
     """
 
-    def __init__(self, models: Path, options: Sequence[str] = ()) -> None:
+    def __init__(self, models: Sequence[Path], options: Sequence[str] = ()) -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
             port = free.getsockname()[1]
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
         command = [sys.executable, "-c", _MAIN, "serve", "--port", str(port)]
-        command += ["--models", str(models), "--log-level", "warning", *options]
+        command += [word for root in models for word in ("--models", str(root))]
+        command += ["--log-level", "warning", *options]
         self.process = subprocess.Popen(
             command,
             stdout=subprocess.DEVNULL,

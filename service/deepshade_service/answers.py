@@ -90,18 +90,20 @@ def encode(
 ) -> tuple[bytes, str]:
     """The answer's bytes and media type; each of several effects is a layer of its name.
 
-    Its header holds the facts and, as JSON, the plan of each. `own` are the channels of the
-    picture itself that go in; those of its beauty are multiplied in place.
+    Its header holds the facts and, as JSON, the plan of each; a PNG's the plan alone. `own` are the
+    channels of the picture itself that go in; those of its beauty are multiplied in place.
     """
     for name, factor in zip(
         composition.beauty, np.broadcast_to(shades[0], (3, *shades[0].shape[1:])), strict=False
     ):
         np.multiply(own[name], factor, out=own[name], where=np.isfinite(own[name]))
-    if asked.format == "png" and composition.beauty:
-        beauty = np.stack([own[name] for name in composition.beauty])
-        return pictures.png(pictures.srgb(beauty)), "image/png"
+    plan = json.dumps(plan_of(made), separators=(",", ":"))
     if asked.format == "png":
-        return pictures.png(pictures.of_effect(shades[0], EFFECTS[made[0].effect])), "image/png"
+        if composition.beauty:
+            picture = pictures.srgb(np.stack([own[name] for name in composition.beauty]))
+        else:
+            picture = pictures.of_effect(shades[0], EFFECTS[made[0].effect])
+        return pictures.png(picture, {"deepshade:plan": plan}), "image/png"
     channels = dict(own)
     attributes = {**composition.attributes, **place.attributes}
     alone = f"{composition.layer}." if composition.layer else ""
@@ -112,7 +114,7 @@ def encode(
         attributes |= {f"deepshade:{key}{name}": value for name, value in each.facts.items()}
     if len(made) > 1:
         attributes["deepshade:effects"] = ",".join(each.effect for each in made)
-    attributes["deepshade:plan"] = json.dumps(plan_of(made), separators=(",", ":"))
+    attributes["deepshade:plan"] = plan
     floats = {
         name for name in channels if not (composition.own[name].half if name in own else asked.half)
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import tracemalloc
+from dataclasses import replace
 
 import httpx
 import numpy as np
@@ -117,11 +118,11 @@ def test_explain_is_the_plan_of_the_answer(server, make_exr):
     with Client(server) as client:
         plan = client.explain("ao", make_exr(24, 32), options)
         answer = client.shade("ao", make_exr(24, 32), options)
-        png = client.shade("ao", make_exr(24, 32), Options(format="png"))
+        png = client.shade("ao", make_exr(24, 32), replace(options, format="png"))
     assert plan["asked"] == {"bundle": "tiny", "engine": "onnxruntime", "precision": "fp32"}
     assert plan["radius"] == 0.25
     assert answer.plan() == plan
-    assert png.plan() == {}
+    assert png.plan() == plan
 
     async def work():
         async with AsyncClient(server) as client:
@@ -449,6 +450,22 @@ def test_tries_again_what_may_succeed(failure):
             return await client.effects()
 
     assert asyncio.run(work()) == []
+
+
+def test_a_timeout_may_be_a_number():
+    seen = []
+
+    def answer(request):
+        seen.append(request.extensions["timeout"])
+        return ok()
+
+    for timeout in (7, Timeout(answer=7)):
+        with Client(transport=httpx.MockTransport(answer), timeout=timeout) as client:
+            client.effects()
+    assert seen == [Timeout(answer=7).as_httpx().as_dict()] * 2
+    for wrong in (0, -1.5, float("nan"), float("inf"), "7"):
+        with pytest.raises(ClientError, match="seconds above 0"):
+            Client(timeout=wrong)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import time
 import pytest
 
 from deepshade import exr
+from deepshade.pictures import texts_of
 from deepshade_client import batch, report
 from deepshade_client.batch import UsageError, plan
 from deepshade_client.cli import main
@@ -274,6 +275,14 @@ def test_a_sequence_has_one_radius(run, make_exr, make_picture, tmp_path):
     assert radii("--radius", "15%") == [first] * 3
     for path in tmp_path.glob("out.*"):
         path.unlink()
+    pngs = tmp_path / "pngs"
+    for _ in range(2):  # PNGs remember it too
+        run("shade", "ao", tmp_path / "s.####.exr", "-o", f"{pngs}/", "--png", "--skip-existing")
+        made = [texts_of(path.read_bytes()) for path in sorted(pngs.iterdir())]
+        assert [json.loads(texts["deepshade:plan"])["radius"] for texts in made] == [
+            pytest.approx(first)
+        ] * 3
+        (pngs / "s.0003.png").unlink()
     (tmp_path / "s.0001.exr").write_bytes(b"damaged")
     assert radii(code=1) == [pytest.approx(2 * first, rel=1e-3)] * 2  # of the first one shaded
 

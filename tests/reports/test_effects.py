@@ -51,7 +51,7 @@ def made(root: Path, paper: bool) -> tuple[str, dict[str, str]]:
     def context(effect: str) -> Context:
         folder = root / "rest" / "gi" / "paper" if paper else None
         out = root / "out" / str(paper) / effect
-        return Context(root / "models", root / "data", out, folder, effect, threads=1, quick=True)
+        return Context([root / "models"], root / "data", out, folder, effect, threads=1, quick=True)
 
     wrong = effects.write([root / "docs" / "effects.md", root / "README.md"], context)
     return (root / "docs" / "effects.md").read_text(), wrong

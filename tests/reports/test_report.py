@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +35,16 @@ from .small import SIZE, write_bundle, write_data
 def root(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp(request.param) / request.param
     write_bundle(folder / "models" / request.param / "fast", 4, 0)
-    write_bundle(folder / "models" / request.param / "paper", 16, 1)
+    write_bundle(folder / "more" / request.param / "paper", 16, 1)
+    # of two with one name that of the folder named first counts
+    write_bundle(folder / "more" / request.param / "fast", 8, 2)
     write_data(folder / "data", request.param)
     return folder
 
 
-def arguments(root: Path, *more: str) -> list[str]:
-    found = [f"--{name}={root / name}" for name in ("models", "data", "out")]
+def arguments(root: Path, *more: str, models: Sequence[Path] = ()) -> list[str]:
+    found = [f"--models={path}" for path in models or (root / "models", root / "more")]
+    found += [f"--{name}={root / name}" for name in ("data", "out")]
     return [*found, f"--effect={root.name}", *more]
 
 
@@ -117,8 +121,10 @@ def test_a_network_takes_any_size(root: Path) -> None:
 
 
 def test_nothing_to_measure_is_an_error(root: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="holds no bundle"):
-        run(*arguments(root, f"--models={tmp_path}"))
+    with pytest.raises(ConfigError, match="no bundle for"):
+        run(*arguments(root, models=[tmp_path]))
+    with pytest.raises(ConfigError, match="there is no folder"):
+        run(*arguments(root, models=[tmp_path / "nowhere"]))
     with pytest.raises(DataError, match="manifest"):
         run(*arguments(root, f"--data={tmp_path}"))
     with pytest.raises(ConfigError, match="no section is called 'sped'"):
@@ -219,7 +225,7 @@ def test_the_frontier_is_what_nothing_beats() -> None:
 
 
 def test_the_page_stands_alone_and_escapes_what_was_measured(tmp_path: Path) -> None:
-    context = Context(tmp_path, tmp_path, tmp_path, threads=2)
+    context = Context([tmp_path], tmp_path, tmp_path, threads=2)
     document = report.document(context, made_up(), "key")
     drawn = plots.speed_error(document["sections"], "ao")
     assert drawn is not None
@@ -253,7 +259,7 @@ def test_sections_are_kept_and_what_breaks_keeps_what_is_done(
     sections = {name: measuring(name) for name in report.SECTIONS}
     monkeypatch.setattr(report, "SECTIONS", sections)
     monkeypatch.setattr(plots, "speed_error", lambda *_: None)  # to draw takes long
-    context = Context(root / "models", root / "data", tmp_path, effect=root.name, quick=True)
+    context = Context([root / "models"], root / "data", tmp_path, effect=root.name, quick=True)
     with pytest.raises(KeyboardInterrupt):
         report.measure(context)
     found = json.loads((tmp_path / "report.json").read_text())["sections"]

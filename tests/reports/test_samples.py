@@ -39,7 +39,7 @@ def test_what_an_environment_lit_is_lit_by_it(effect: str) -> None:
 
 def test_a_folder_without_references_is_an_error(tmp_path: Path) -> None:
     exr.write(tmp_path / "shot.exr", {"Z": np.ones((8, 8), np.float32)})
-    models = Path(__file__).parents[2] / "models"
+    models = [Path(__file__).parents[2] / "models"]
     with pytest.raises(DataError, match=r"no EXR file of .* has a reference of 'ao'"):
         Context(models, tmp_path, tmp_path / "out").views  # noqa: B018
     with pytest.raises((ConfigError, DataError)):

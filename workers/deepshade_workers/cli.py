@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -333,7 +335,8 @@ def datagen(
     )
     warn(notes_of(spec.scenes))
     begun = time.monotonic()
-    done, fresh = _watched(generate(spec, out, address=address), hidden=as_json)
+    with contextlib.redirect_stdout(sys.stderr):  # where Ray tells of workers that died
+        done, fresh = _watched(generate(spec, out, address=address), hidden=as_json)
     seconds = time.monotonic() - begun
     summary = {
         "out": str(out),

@@ -123,7 +123,12 @@ def notes_of(names: Iterable[str]) -> tuple[str, ...]:
         else:
             found = (Path(name),)
         paths |= {path: None for path in found if path.suffix.lower() in MESH_SUFFIXES}
-    return tuple(note for path in paths if path.is_file() for note in load_mesh(path).notes)
+    notes: list[str] = []
+    for path in paths:
+        if path.is_file():
+            mesh = load_mesh(path)  # the one before lives until then: a pack's texture is made once
+            notes += mesh.notes
+    return tuple(notes)
 
 
 _kept = functools.lru_cache(maxsize=256)(load_mesh)

@@ -1,12 +1,11 @@
-"""README's commands for making a shader, as `examples/researcher.py` runs them, in small."""
+"""`examples/researcher.py`, from the wheel, in small: README's commands for making a shader."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jsonschema
@@ -14,17 +13,19 @@ import pytest
 import yaml
 from ray.autoscaler._private.util import prepare_config, validate_config
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # about a minute of one core; Ray, Mitsuba and PyTorch start in it
-def test_the_commands_make_a_shader(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("outside")
+def test_the_commands_make_a_shader(
+    wheel: Path, environment: Callable[..., Path], tmp_path: Path
+) -> None:
+    bin = environment(tmp_path / "env", "deepshade[all]", wheel=wheel)
     shutil.copytree(ROOT / "models/ao/fast", tmp_path / "models/ao/fast")
-    command = [sys.executable, str(ROOT / "examples/researcher.py"), "--small"]
-    # elsewhere, so what PYTHONPATH names by relative paths must be found there too
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
-    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+    command = [bin / "python", ROOT / "examples" / "researcher.py", "--small"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert done.stdout.count("$ deepshade") >= 8
     bundle = tmp_path / "models/ao/mine"
