@@ -74,10 +74,10 @@ class MissingAttributeError(DeepshadeError):
 class AmbiguousChannelError(DeepshadeError):
     """Several channels could be the same attribute; deepshade never guesses."""
 
-    def __init__(self, attribute: str, candidates: Sequence[str]) -> None:
+    def __init__(self, attribute: str, candidates: Sequence[str], *, fix: str = "") -> None:
         super().__init__(
             f"'{attribute}' could be any of: {_shortened(candidates)}",
-            fix=f"choose one: --map {attribute}={candidates[0]}",
+            fix=fix or f"choose one: --map {attribute}={candidates[0]}",
         )
         self.attribute = attribute
         self.candidates = tuple(candidates)

@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
-from deepshade.camera import Camera, placement_of
+from deepshade.camera import Camera, Projection, placement_of
 from deepshade.errors import ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
 from deepshade.exr.entries import Entry
 from deepshade.gbuffer import background, channels, derivation
 from deepshade.gbuffer.checks import Verdict, examine
 from deepshade.gbuffer.conventions import Conventions, apply
+from deepshade.gbuffer.lenses import number
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
-from deepshade.gbuffer.profiles import QUANTITIES, number
+from deepshade.gbuffer.profiles import QUANTITIES
 from deepshade.gbuffer.repair import repair
 from deepshade.gbuffer.sources import passed_over
 
@@ -105,6 +106,9 @@ def load_gbuffers(
     profile: str | None = None,
     mapping: Mapping[str, str] | None = None,
     fov: float | None = None,
+    projection: Projection | None = None,
+    ortho_width: float | None = None,
+    view: str | None = None,
     limits: Limits | None = None,
     headers: Sequence[Header] | None = None,
     anew: Collection[str] = (),
@@ -115,7 +119,9 @@ def load_gbuffers(
 
     A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
     (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
-    comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
+    comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees, of
+    another `projection` an orthographic one is `ortho_width` scene units wide. `view` names one of
+    the views of stereo files, or a part; without it the default one is read.
     What isn't there, or is to be `anew`, is derived (`derivation`): `GBuffer.derived` says how.
     `conventions` say how values are stored, and which checks they have to pass (`checks`).
     Positions whose steps are coarse beside the `radius` (by default the header's) are smoothed.
@@ -149,7 +155,17 @@ def load_gbuffers(
         return {name: read[choice][0] for name, choice in choices.items()}
 
     def plan(wanted: Sequence[str]) -> Plan:
-        found = plan_gbuffer(headers, stems, wanted, profile=profile, mapping=mapping, fov=fov)
+        found = plan_gbuffer(
+            headers,
+            stems,
+            wanted,
+            profile=profile,
+            mapping=mapping,
+            fov=fov,
+            projection=projection,
+            across=ortho_width,
+            view=view,
+        )
         found.passed_over = passed_over(found, mapping or {}, conventions, reader)
         for name in (*anew, *found.passed_over):
             found.choices.pop(name, None)

@@ -8,7 +8,6 @@ come from Mitsuba, or when the profile is asked for. Depths along the view axis 
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.errors import ConfigError
+from deepshade.gbuffer.lenses import number
 
 # What a file may hold beyond the attributes themselves; attributes are derived from them.
 QUANTITIES: dict[str, int] = {
@@ -102,16 +102,6 @@ def _blender(header: Header) -> bool:
     return _signed("cycles.", "blender")(header) or str(header.get("File", "")).endswith(".blend")
 
 
-def number(header: Header, *keys: str) -> float:
-    """The first of these attributes that is a number; NaN if none is."""
-    for key in keys:
-        try:
-            return float(header[key])
-        except (KeyError, TypeError, ValueError):
-            continue
-    return math.nan
-
-
 def _unreal_matrix(header: Header) -> NDArray[np.float64] | None:
     """World (left-handed, z up, x forward at zero rotation, cm) to our camera space."""
     place, turn = (
@@ -184,7 +174,6 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("motionvector",), _UP_TO_DOWN),
         ),
         _signed("arnold/"),
-        fov=("CameraFov",),
     ),
     Profile(
         "renderman",
