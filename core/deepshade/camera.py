@@ -145,6 +145,17 @@ class Camera:
         x, y, z = self._directions(columns, rows)
         return np.stack(np.broadcast_arrays(x, y, z))
 
+    def points_at(
+        self,
+        columns: NDArray[np.integer[Any]],
+        rows: NDArray[np.integer[Any]],
+        depth: NDArray[np.floating[Any]],
+    ) -> NDArray[np.float64]:
+        """Camera-space positions (3, ...) of some pixels at these depths (...)."""
+        if self.projection == "orthographic":
+            return np.stack([*self._slopes(columns, rows), -depth])
+        return self.rays_at(columns, rows) * depth
+
     def _directions(
         self, columns: NDArray[np.integer[Any]], rows: NDArray[np.integer[Any]]
     ) -> tuple[Any, Any, Any]:
@@ -159,7 +170,7 @@ class Camera:
     def _slopes(
         self, columns: NDArray[np.integer[Any]], rows: NDArray[np.integer[Any]]
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """x and y of the stored pixels' centres where they see distance 1 (of parallel rays any)."""
+        """x and y of the stored pixels' centres at distance 1, of parallel rays at any."""
         scale = 1.0 / self.pixels_per_unit
         x = (columns + (self.x0 + 0.5 - 0.5 * self.width)) * scale + self.center[0]
         y = 0.5 * self.height - self.y0 - 0.5 - rows

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera, Projection, placement_of
-from deepshade.errors import ConfigError, ImageError, MissingAttributeError
+from deepshade.errors import CameraError, ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
 from deepshade.exr.entries import Entry
 from deepshade.gbuffer import background, channels, derivation
 from deepshade.gbuffer.checks import Verdict, examine
 from deepshade.gbuffer.conventions import Conventions, apply
+from deepshade.gbuffer.guesses import suggestion
 from deepshade.gbuffer.lenses import number
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
 from deepshade.gbuffer.profiles import QUANTITIES
@@ -169,7 +170,13 @@ def load_gbuffers(
         found.passed_over = passed_over(found, mapping or {}, conventions, reader)
         for name in (*anew, *found.passed_over):
             found.choices.pop(name, None)
-        found.require(wanted)
+        try:
+            found.require(wanted)
+        except CameraError as error:
+            if lens := suggestion(found, reader):
+                detail = f"{error}; depth and normals go together with {lens}"
+                raise CameraError(detail, fix=f"{lens}; else {error.fix}") from None
+            raise
         return found
 
     try:
@@ -231,7 +238,7 @@ def _load(
             warnings=tuple(verdict.warnings),
             header=job.plan.attributes,
             part_header=job.part.attributes,
-            entries=job.part.entries,
+            entries=_entries(job),
             data_window=job.part.data_window,
             display_window=job.part.display_window,
             up=job.plan.profile.up if job.plan.profile else "y",
@@ -278,7 +285,7 @@ def _together(
         return None
     empty, nonfinite = background.remove(arrays, suspects)
     plan = jobs[0].plan
-    if jobs[0].conventions.checks != "trust":
+    if jobs[0].conventions.checks != "trust" and plan.projection in (None, "perspective"):
         reach = jobs[0].radius or number(plan.attributes, "deepshade:radius")
         mended = repair(arrays, ~empty, plan.camera, plan.matrix, reach if reach > 0 else None)
         for name, note in mended.items():
@@ -308,11 +315,20 @@ def _checked(
 
 def _said(job: _Job, verdict: Verdict) -> dict[str, str]:
     """How what the job needs was derived, and how what that came from had to be read."""
-    derived = {name: job.plan.how(step) for name, step in job.steps.items()}
+    view = {"view": note} if (note := job.plan.views.note) else {}
+    derived = view | {name: job.plan.how(step) for name, step in job.steps.items()}
     for name, note in verdict.notes.items():
         if name in job.choices:
             derived[name] = f"{derived[name]}; {note}" if name in derived else note
     return derived
+
+
+def _entries(job: _Job) -> dict[str, Entry]:
+    """What an answer keeps of the part's header, and which view it is of."""
+    views = job.plan.views
+    if "view" in job.part.entries or not (views.read in views.names and views.note):
+        return job.part.entries
+    return job.part.entries | {"view": Entry("string", views.read.encode())}
 
 
 def source_name(field: str, filename: str) -> str:

@@ -123,9 +123,13 @@ def _unreal_matrix(header: Header) -> NDArray[np.float64] | None:
 _UP_TO_DOWN = (1, -1)  # image v points down
 _INTO_SCREEN = (1, 1, -1)  # a left-handed camera's z
 
-_CANONICAL = tuple(
-    Source(name, ("Z", "depth") if name == "depth" else (name,)) for name in ATTRIBUTES
-)
+# what people call them besides
+_ALSO = {
+    "depth": ("Z", "depth", "Pz"),  # Pz: Houdini's
+    "position": ("position", "P_camera", "P.camera", "position_camera"),  # 3Delight has dots
+    "normal": ("normal", "N_camera", "N.camera", "normal_camera"),
+}
+_CANONICAL = tuple(Source(name, _ALSO.get(name, (name,))) for name in ATTRIBUTES)
 
 _TABLE: Sequence[Profile] = (
     Profile(
@@ -133,6 +137,7 @@ _TABLE: Sequence[Profile] = (
         (
             *_CANONICAL,
             Source("position_world", ("position_world",)),
+            Source("distance", ("distance",)),
             Source("alpha", ("A",)),
             Source("beauty", ("beauty", "Combined", "Image", "rgba", "rgb", "Ci")),
         ),
