@@ -23,6 +23,7 @@ from deepshade.gbuffer.conventions import Conventions, apply
 from deepshade.gbuffer.guesses import suggestion
 from deepshade.gbuffer.lenses import number
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
+from deepshade.gbuffer.poses import find_pose
 from deepshade.gbuffer.profiles import QUANTITIES
 from deepshade.gbuffer.repair import repair
 from deepshade.gbuffer.sources import passed_over
@@ -167,6 +168,7 @@ def load_gbuffers(
             across=ortho_width,
             view=view,
         )
+        find_pose(found, conventions, reader)
         found.passed_over = passed_over(found, mapping or {}, conventions, reader)
         for name in (*anew, *found.passed_over):
             found.choices.pop(name, None)

@@ -41,6 +41,8 @@ class Plan:
     projection: Projection | None = None  # as far as it is known, even where its width isn't
     unusable: dict[derivation.Requirement, str] = field(default_factory=dict)  # why
     passed_over: dict[str, str] = field(default_factory=dict)  # quantity -> why
+    wanted: tuple[str, ...] = ()  # all that what is needed could come from
+    pose: str = ""  # how the matrix was found, if no header has it
 
     def steps(self, attribute: str) -> list[derivation.Derivation] | None:
         """Derivations that lead to `attribute`; [] if it is in the files, None if impossible."""
@@ -85,6 +87,8 @@ class Plan:
         """How a derivation gets its attribute, and what it had to pass over."""
         if step.target == "normal" and "position" in step.needs and "normal_world" in self.choices:
             return f"{step.how} (the world-space normals there need worldToCamera)"
+        if self.pose and step.requires == "matrix":
+            return f"{step.how} ({self.pose})"
         if step.target == "position" and self.passed_over:
             return f"{step.how} ({'; '.join(self.passed_over.values())})"
         return step.how
@@ -159,6 +163,7 @@ def plan_gbuffer(
         if known is None and choice.profile not in ("", "deepshade"):
             known = PROFILES[choice.profile]  # for its handedness: the names gave it away
     plan = Plan(list(headers), layers, choices, ambiguous, known, attributes, seen)
+    plan.wanted = tuple(wanted)
     for name, error in ambiguous.items():
         if fix := _view_fix(plan, error):
             ambiguous[name] = AmbiguousChannelError(name, error.candidates, fix=fix)
