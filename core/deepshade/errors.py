@@ -122,12 +122,14 @@ class SceneError(DeepshadeError):
 class ConfigError(DeepshadeError):
     """A setting has an unknown name or an impossible value."""
 
-    def __init__(self, key: str, known: Iterable[str] = (), *, detail: str = "") -> None:
+    def __init__(
+        self, key: str, known: Iterable[str] = (), *, detail: str = "", fix: str = ""
+    ) -> None:
         self.key = key
         self.nearest = nearest(key, known)
         super().__init__(
             detail or f"unknown setting '{key}'",
-            fix=f"did you mean '{self.nearest}'?" if self.nearest else "",
+            fix=fix or (f"did you mean '{self.nearest}'?" if self.nearest else ""),
         )
 
 

@@ -118,6 +118,29 @@ class ShadeParameters(BaseModel):
             " derived from depth and the header doesn't say.",
         ),
     ] = None
+    projection: Annotated[
+        Literal["perspective", "orthographic", "latlong"] | None,
+        Field(
+            description="How the camera projects; else what the header says, else `perspective`."
+            " `orthographic` needs `ortho_width`, `latlong` is a panorama all around."
+        ),
+    ] = None
+    ortho_width: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            allow_inf_nan=False,
+            description="Width of an orthographic camera's frame in scene units.",
+        ),
+    ] = None
+    view: Annotated[
+        str | None,
+        Field(
+            max_length=200,
+            description="Which view of a stereo or multi-view file, as `left`, or which part by its"
+            " name; else the file's default one.",
+        ),
+    ] = None
     profile: Annotated[
         Profile | None, Field(description="The renderer whose channel names to expect.")
     ] = None
@@ -294,6 +317,11 @@ class ShadeParameters(BaseModel):
         return None if self.world_to_camera is None else parse_matrix(self.world_to_camera)
 
     @property
+    def orthographic(self) -> bool:
+        """Whether a camera with parallel rays is asked for."""
+        return self.projection == "orthographic" or self.ortho_width is not None
+
+    @property
     def mapping(self) -> dict[str, str]:
         """`map` as attribute -> channel or layer."""
         return parse_mapping(self.map)
@@ -312,6 +340,20 @@ class ShadeParameters(BaseModel):
                 f"{asked} {'has' if len(effects) == 1 else 'have'} no setting '{name}'",
                 fix=f"leave out ?{name}=; it is a setting of {', '.join(having)}",
                 effects=having,
+            )
+        if self.ortho_width is not None and self.projection not in (None, "orthographic"):
+            raise Problem(
+                422,
+                "bad-parameter",
+                f"ortho_width is of an orthographic camera, not of a {self.projection} one",
+                fix="leave out ?ortho_width= or ?projection=",
+            )
+        if self.fov is not None and self.orthographic:
+            raise Problem(
+                422,
+                "bad-parameter",
+                "an orthographic camera has no field of view",
+                fix="leave out ?fov=; ?ortho_width= is the frame's width in scene units",
             )
         if self.strict and self.trust:
             raise Problem(

@@ -21,6 +21,7 @@ from deepshade.engines import Engine
 from deepshade.environments import Prepared
 from deepshade.gbuffer import GBuffer
 from deepshade.machine import trim
+from deepshade_service import panoramas
 from deepshade_service.answers import Made, Place, Shaded, encode, plan_of
 from deepshade_service.composition import Composition, bytes_of, compose
 from deepshade_service.decoding import decode, read_headers
@@ -179,7 +180,10 @@ def run(
     `held` is the memory that the request holds. Raises what the steps raise.
     """
     watch, bundle = Stopwatch(), job.bundle
+    around = panoramas.is_panorama(gbuffer)
     with watch.time("plan"):
+        if around:
+            panoramas.check(bundle)
         plan = plan_shading(gbuffer, bundle, asked, job.need.max_pixels)
         if job.prepared is not None:
             plan = lit(plan, job.prepared, gbuffer, bundle, asked)
@@ -191,7 +195,10 @@ def run(
     shade = np.empty((0, 0, 0), np.float32)
     if job.engine is not None:
         with watch.time("infer"):
-            shade = infer(gbuffer, plan, job.engine, cancelled)
+            if around:
+                shade = _around(job, gbuffer, plan, asked, cancelled)
+            else:
+                shade = infer(gbuffer, plan, job.engine, cancelled)
         if held > _BIG:
             job.engine.shrink()  # for the next one
     pixels = gbuffer.background.size
@@ -210,7 +217,8 @@ def plan_shading(
     tiles = tuple(grid)
     if EFFECTS[bundle.effect].background != "shaded":
         tiles = tuple(tile for tile in tiles if not gbuffer.background[tile.answered].all())
-    return ShadePlan(radius_of(gbuffer, bundle, asked), grid.shape, tiles)
+    sized = panoramas.measured(gbuffer) if panoramas.is_panorama(gbuffer) else gbuffer
+    return ShadePlan(radius_of(sized, bundle, asked), grid.shape, tiles)
 
 
 def lit(
@@ -257,6 +265,30 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
             f"the network '{bundle.name}' gave numbers that aren't finite",
             fix="report it with the picture; another ?radius= or ?bundle= may work",
         )
+    return shade
+
+
+def _around(
+    job: Job,
+    gbuffer: GBuffer,
+    plan: ShadePlan,
+    asked: ShadeParameters,
+    cancelled: threading.Event,
+) -> Float:
+    """`infer` of a panorama, by the views that it is cut into."""
+    assert job.engine is not None, "what is only planned isn't inferred"
+    effect = EFFECTS[job.bundle.effect]
+    shade = np.empty((len(effect.outputs), *gbuffer.shape), np.float32)
+    for face in panoramas.faces(gbuffer):
+        part = plan_shading(face.gbuffer, job.bundle, asked, job.need.max_pixels)
+        part = replace(part, radius=plan.radius)
+        if job.prepared is not None:
+            part = lit(part, job.prepared, face.gbuffer, job.bundle, asked)
+        shade[:, face.of] = infer(face.gbuffer, part, job.engine, cancelled)[:, *face.at]
+    if effect.background == "light":
+        np.copyto(shade, gbuffer.attributes["light"], where=gbuffer.background)
+    elif effect.background != "shaded":
+        np.copyto(shade, np.float32(effect.background), where=gbuffer.background)
     return shade
 
 

@@ -22,6 +22,7 @@ from deepshade.gbuffer.views import Views
 
 MARKERS = ("depth", "distance", "alpha")  # read, where there, to know the background
 
+_RAYS = {"orthographic": "the width of the frame", "latlong": "the rays of a panorama"}
 ABSENT = "not there"  # why an attribute can't be had, when nothing would make it derivable
 
 
@@ -85,13 +86,16 @@ class Plan:
 
     def how(self, step: derivation.Derivation) -> str:
         """How a derivation gets its attribute, and what it had to pass over."""
+        how = step.how
+        if step.requires == "fov" and self.projection in _RAYS:
+            how = how.replace("the field of view", _RAYS[self.projection])
         if step.target == "normal" and "position" in step.needs and "normal_world" in self.choices:
-            return f"{step.how} (the world-space normals there need worldToCamera)"
+            return f"{how} (the world-space normals there need worldToCamera)"
         if self.pose and step.requires == "matrix":
-            return f"{step.how} ({self.pose})"
+            return f"{how} ({self.pose})"
         if step.target == "position" and self.passed_over:
-            return f"{step.how} ({'; '.join(self.passed_over.values())})"
-        return step.how
+            return f"{how} ({'; '.join(self.passed_over.values())})"
+        return how
 
     def require(self, needs: Sequence[str]) -> None:
         """Raises what stands in the way of `needs`; returns if nothing does.

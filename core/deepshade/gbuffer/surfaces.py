@@ -113,13 +113,22 @@ def _together(e: Examination, name: str, source: str, kinds: Sequence[Kind]) -> 
     e.clear &= bool(stated < least - _ALIKE)
     if facing > _SEEN and stated < least + _ALIKE:
         if stated > _UNLIKELY:
-            e.warn(f"'{name}' hardly fits the surfaces that '{source}' shows")
+            lens = _lens(e, name, source)
+            would = f"; with {lens} it would" if lens else ""
+            e.warn(f"'{name}' hardly fits the surfaces that '{source}' shows{would}")
         return True
     equals = [each for each in tried if each[0] < least + _ALIKE / 2]
     if least > _UNLIKELY:
         equals = []
     _settle(e, name, source, float(facing), kinds[0], equals, normals)
     return True
+
+
+def _lens(e: Examination, name: str, source: str) -> str:
+    """The options that ask for a lens with which both would go together; "" for none."""
+    if e.camera is None or (name, source) != ("normal", "depth"):
+        return ""
+    return fitting_lens(e.arrays[name], e.arrays[source], e.camera)
 
 
 def _settle(
@@ -138,9 +147,7 @@ def _settle(
         else (f"'{name}' and '{source}' contradict each other")
     )
     if not equals:
-        lens = ""
-        if e.camera is not None and (name, source) == ("normal", "depth"):
-            lens = fitting_lens(e.arrays[name], e.arrays[source], e.camera)
+        lens = _lens(e, name, source)
         why = f"{seen}, and with no axes does it fit the surfaces that '{source}' shows"
         raise ContradictionError(
             f"{why}; with another lens it would" if lens else why,

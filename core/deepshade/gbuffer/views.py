@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from deepshade.errors import ConfigError
+from deepshade.errors import ConfigError, nearest
 from deepshade.exr import Header, Part
 
 STEREO = ("left", "right")  # which are views even where nothing says so
@@ -74,12 +74,15 @@ def choose(headers: Sequence[Header], asked: str | None) -> Views:
     if asked is not None:
         known = {name.lower(): name for name in (*(part.name for part in parts), *names) if name}
         if asked.lower() not in known:
-            there = ", ".join(known.values())
+            there = list(known.values())
             raise ConfigError(
                 asked,
-                known.values(),
-                detail=f"there is no view '{asked:.60}' here"
-                + (f", only {there:.200}" if there else ""),
+                detail=f"there is no view '{asked:.60}' here, only {', '.join(there):.200}"
+                if there
+                else f"there is no view '{asked:.60}' here, nor any other",
+                fix=f"read one that is there: --view {nearest(asked, there) or there[0]}"
+                if there
+                else "leave out --view",
             )
         return Views(names, known[asked.lower()], default=False)
     if len(names) < 2:
