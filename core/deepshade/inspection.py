@@ -124,8 +124,9 @@ def inspect_files(
     ambiguous, effects (for each: ready, bundles, have, derived, missing), statistics, and checks
     (derived, warnings, and the contradiction with its fix, if there is one). `matrix` is
     worldToCamera (4, 4), for column vectors, in place of the header's. An effect is ready when a
-    bundle of it is installed whose inputs are there or can be derived. Raises what `load_gbuffer` raises for files
-    that can't be read, but not for missing or ambiguous attributes: those are the report.
+    bundle of it is installed whose inputs are there or can be derived. Raises what `load_gbuffer`
+    raises for files that can't be read, but not for missing or ambiguous attributes: those are the
+    report.
     """
     from deepshade import exr
     from deepshade.attributes import ATTRIBUTES

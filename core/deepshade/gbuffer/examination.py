@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade.camera import Camera
+from deepshade.errors import ContradictionError
 from deepshade.gbuffer.background import DEPTHS, FAR, SURFACE
 from deepshade.gbuffer.conventions import Conventions, Reading
 from deepshade.gbuffer.pairs import Pairs
@@ -32,6 +33,12 @@ class Verdict:
     def note(self, name: str, text: str) -> None:
         """Says something of a quantity, behind what was said before."""
         self.notes[name] = f"{self.notes[name]}; {text}" if name in self.notes else text
+
+    def warn(self, text: str, conventions: Conventions) -> None:
+        """Says what looks unlikely. Raises ContradictionError where that is an error."""
+        self.warnings.append(text)
+        if conventions.checks == "strict":
+            raise ContradictionError(text, fix="leave out --strict to have it shaded")
 
 
 class Examination:

@@ -22,6 +22,7 @@ from deepshade.gbuffer.checks import Verdict, examine
 from deepshade.gbuffer.conventions import Conventions, apply
 from deepshade.gbuffer.guesses import suggestion
 from deepshade.gbuffer.lenses import number
+from deepshade.gbuffer.mixtures import unmix
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
 from deepshade.gbuffer.poses import find_pose
 from deepshade.gbuffer.profiles import QUANTITIES
@@ -283,6 +284,12 @@ def _together(
     choices = {name: choice for job in jobs for name, choice in job.choices.items()}
     arrays, suspects = _read(bodies, headers, choices, limits, read)
     verdict = _checked(jobs, choices, arrays)
+    if jobs[0].conventions.checks != "trust":
+        notes, warning = unmix(arrays)
+        for name, note in notes.items():
+            verdict.note(name, note)
+        if warning:
+            verdict.warn(warning, jobs[0].conventions)
     if len(jobs) > 1 and not background.same(arrays, suspects, [job.choices for job in jobs]):
         return None
     empty, nonfinite = background.remove(arrays, suspects)
