@@ -57,13 +57,14 @@ class MissingAttributeError(DeepshadeError):
         *,
         why: Mapping[str, str] | None = None,
         enough: str = "",
+        fix: str = "",
     ) -> None:
         near = {name: tuple(close) for name, close in (near or {}).items() if close}
         reasons = {name: f" ({why[name]})" for name in missing if why and why.get(name)}
         lacking = ", ".join(f"'{name}'{reasons.get(name, '')}" for name in missing)
         super().__init__(
             f"missing {lacking}; channels found: {_shortened(found) or 'none'}",
-            fix=_mapping_hint(missing, near, enough),
+            fix=fix or _mapping_hint(missing, near, enough),
         )
         self.enough = enough
         self.missing = tuple(missing)

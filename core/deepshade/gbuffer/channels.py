@@ -69,6 +69,7 @@ class Choice:
     channels: tuple[str, ...]
     signs: tuple[int, ...] = ()
     profile: str = ""
+    per_frame: bool = False
 
     def __str__(self) -> str:
         names = ", ".join(self.channels)
@@ -240,7 +241,7 @@ def _search(
                     if len({s.quantity for _, s in options}) > 1
                     else "say by whom: " + " or ".join(f"--profile {q.name}" for q, _ in options),
                 )
-            choice = Choice(quantity, layer.file, channels, source.signs, p.name)
+            choice = Choice(quantity, layer.file, channels, source.signs, p.name, source.per_frame)
             found.append((rank, layer, choice))
             break
     if not found:

@@ -29,6 +29,7 @@ from deepshade.gbuffer.profiles import QUANTITIES
 from deepshade.gbuffer.repair import repair
 from deepshade.gbuffer.sources import passed_over
 
+SHUTTER = "deepshade:shutter"
 Source = Path | str | bytes | tuple[str, bytes]
 # quantities that were read to choose between them, and whether they hold NaN or infinities
 _Read = dict[channels.Choice, tuple[NDArray[np.float32], bool]]
@@ -47,6 +48,7 @@ class GBuffer:
     windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes came from,
     `part_header` its own attributes, `entries` those of the shot; `header` holds those of all
     parts and files, the first of each name. `up` is the world's up axis, as its renderer has it.
+    Motion that is `per_frame` is of the whole interval between two frames, whatever the shutter.
     """
 
     attributes: dict[str, NDArray[np.float32]]
@@ -63,6 +65,7 @@ class GBuffer:
     data_window: exr.Window = (0, 0, 0, 0)
     display_window: exr.Window = (0, 0, 0, 0)
     up: Literal["y", "z"] = "y"
+    per_frame: bool = False
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -230,6 +233,9 @@ def _load(
         return
     arrays, empty, nonfinite, verdict = loaded
     for job in jobs:
+        motion = job.choices.get("motion")
+        # without a shutter's time of its own it is open throughout
+        per_frame = motion is not None and motion.per_frame and SHUTTER not in job.plan.attributes
         yield GBuffer(
             attributes={name: arrays[name] for name in job.needs},
             background=empty,
@@ -239,12 +245,13 @@ def _load(
             decoded=tuple((c.file, name) for c in job.choices.values() for name in c.channels),
             derived=_said(job, verdict),
             warnings=tuple(verdict.warnings),
-            header=job.plan.attributes,
+            header={SHUTTER: 1.0} | job.plan.attributes if per_frame else job.plan.attributes,
             part_header=job.part.attributes,
             entries=_entries(job),
             data_window=job.part.data_window,
             display_window=job.part.display_window,
             up=job.plan.profile.up if job.plan.profile else "y",
+            per_frame=per_frame,
         )
 
 

@@ -118,7 +118,10 @@ class Plan:
         if missing:
             found = [name for layer in self.layers for name in layer.channels]
             near = near_misses(self.layers, missing)
-            raise MissingAttributeError(missing, found, near, enough=derivation.enough(missing))
+            enough = derivation.enough(missing)
+            by = self._writers(needs)
+            fix = " or ".join(f"if {name} wrote it: --profile {name}" for name in by)
+            raise MissingAttributeError(missing, found, near, enough=enough, fix=fix)
         wanted = list(dict.fromkeys(need for name in lacking for need in unmet[name]))
         wide = self.projection == "orthographic"
         needed = derivation.requirement_text(wanted)
@@ -132,6 +135,18 @@ class Plan:
             f"{needed}{f' ({why})' if why else ''}",
             fix="; ".join(fixes),
         )
+
+    def _writers(self, needs: Sequence[str]) -> list[str]:
+        """Renderers whose names would give all that is needed."""
+        found: list[str] = []
+        for profile in PROFILES.values():
+            if not profile.free_names or self.profile is not None:
+                continue
+            choices, _ = channels.choose(self.layers, self.wanted, profile, {})
+            met = self.met | {"fov", "matrix"}  # what else is missing is said then
+            if all(derivation.plan(name, choices, met) is not None for name in needs):
+                found.append(profile.name)
+        return found
 
 
 def plan_gbuffer(
