@@ -38,6 +38,7 @@ from deepshade.gbuffer.depths import KINDS, MEANINGS
 from deepshade.gbuffer.profiles import PROFILES
 from deepshade_service.problems import Problem
 
+MAX_VIEWS = 8  # in one answer
 LENS = ("focus", "aperture")  # settings from which the blur circle is derived
 CAMERA = (*LENS, "shutter")
 LIGHT = ("environment", "rotate", "up")
@@ -138,7 +139,8 @@ class ShadeParameters(BaseModel):
         Field(
             max_length=200,
             description="Which view of a stereo or multi-view file, as `left`, or which part by its"
-            " name; else the file's default one.",
+            " name; else the file's default one. Several, as `left,right`, are answered in one"
+            " multi-view EXR.",
         ),
     ] = None
     profile: Annotated[
@@ -317,6 +319,12 @@ class ShadeParameters(BaseModel):
         return None if self.world_to_camera is None else parse_matrix(self.world_to_camera)
 
     @property
+    def views(self) -> list[str]:
+        """The views that are asked for; none where it is left to the file."""
+        names = [name.strip() for name in (self.view or "").split(",")]
+        return list(dict.fromkeys(filter(None, names)))
+
+    @property
     def orthographic(self) -> bool:
         """Whether a camera with parallel rays is asked for."""
         return self.projection == "orthographic" or self.ortho_width is not None
@@ -340,6 +348,21 @@ class ShadeParameters(BaseModel):
                 f"{asked} {'has' if len(effects) == 1 else 'have'} no setting '{name}'",
                 fix=f"leave out ?{name}=; it is a setting of {', '.join(having)}",
                 effects=having,
+            )
+        if len(self.views) > 1 and (self.append or self.multiply or self.format == "png"):
+            name = "append" if self.append else "multiply" if self.multiply else "format"
+            raise Problem(
+                422,
+                "bad-parameter",
+                f"?{name}= is for one view, and several were asked for",
+                fix=f"leave out ?{name}=, or ask for one ?view= at a time",
+            )
+        if len(self.views) > MAX_VIEWS:
+            raise Problem(
+                422,
+                "bad-parameter",
+                f"{len(self.views)} views are more than the {MAX_VIEWS} that one answer may hold",
+                fix="ask for fewer at a time: ?view=left",
             )
         if self.ortho_width is not None and self.projection not in (None, "orthographic"):
             raise Problem(
