@@ -20,6 +20,8 @@ Array = NDArray[np.floating[Any]]
 _ANGLES = np.geomspace(8, 130, 24)
 _APART = 0.05  # by how much the better of two lenses has to fit better
 _FITS = 0.35  # misfit of lenses that fit
+_SAME = 0.9  # cosine of normals on one surface
+_PINHOLE: dict[str, Any] = {"projection": "perspective", "across": 0.0}
 
 
 def suggestion(
@@ -36,44 +38,52 @@ def suggestion(
         return ""
     arrays = read({name: plan.choices[name] for name in ("depth", "normal")})
     windows = part.data_window, part.display_window
-    return fitting_lens(
-        arrays["normal"], arrays["depth"], Camera.framed(part.attributes, *windows, None, fov=50)
-    )
+    camera = Camera.framed(part.attributes, *windows, None, fov=50)
+    return fitting_lens(arrays["normal"], arrays["depth"], camera)[0]
 
 
-def fitting_lens(normal: NDArray[np.float32], planar: NDArray[np.float32], camera: Camera) -> str:
+def fitting_lens(
+    normal: NDArray[np.float32], planar: NDArray[np.float32], camera: Camera
+) -> tuple[str, float]:
     """The options that ask for the lens that fits camera-space normals (3, H, W) and planar depth
-    (1, H, W) best; "" where none fits.
+    (1, H, W) best, and by how much they misfit then; "" and 1 where none fits.
 
     `camera` has the picture's windows; its lens doesn't matter. Parallel rays see a depth that
     changes by -n.x / n.z of what lies between two pixels, which tells the frame's width.
     """
-    # pixels apart: samples that lie anywhere in their pixels are off by less of it
-    pairs = Pairs.of(planar.shape[1:], apart=8 if min(planar.shape[1:]) >= 32 else 1)
-    normals, depth = pairs.cut(normal), pairs.cut(planar)[0]
+    found = [("", 1.0)]
+    # samples that lie anywhere in their pixels are off by less of what lies between distant ones
+    for apart in (1, 4, 8):
+        if min(planar.shape[1:]) >= 4 * apart:
+            pairs = Pairs.of(planar.shape[1:], apart=apart)
+            found.append(_fitting(pairs.cut(normal), pairs.cut(planar)[0], camera, pairs))
+    return min(found, key=lambda each: each[1])
+
+
+def _fitting(normals: Array, depth: Array, camera: Camera, pairs: Pairs) -> tuple[str, float]:
     good = (np.isfinite(depth) & (depth > 0) & (np.abs(normals).sum(0) > 0)).all(0)
-    good &= (normals[:, 0] * normals[:, 1]).sum(0) > 0.9  # one surface
+    good &= (normals[:, 0] * normals[:, 1]).sum(0) > _SAME
     if np.count_nonzero(good) < 32:
-        return ""
+        return "", 1.0
     normals, depth = normals[:, :, good], depth[:, good]
-    columns, rows = pairs.columns[:, good], pairs.rows[:, good]
-    widths = _widths(normals, depth, columns, rows, camera)
-    lenses = [(f"--fov {angle:.3g}", replace(camera, fov=float(angle))) for angle in _ANGLES]
-    if widths > 0:
-        wide = replace(camera, projection="orthographic", across=widths)
-        option = f"--projection orthographic --ortho-width {widths:.3g}"
-        lenses.append((option, wide))
-    off = [_misfit(normals, depth, lens, columns, rows) for _, lens in lenses]
+    at = pairs.columns[:, good], pairs.rows[:, good]
+
+    def perspective(angle: float) -> float:
+        return _misfit(normals, depth, replace(camera, **_PINHOLE, fov=float(angle)), *at)
+
+    off = [perspective(angle) for angle in _ANGLES]
     best = int(np.argmin(off))
-    if lenses[best][1].projection == "perspective":
-        near = np.linspace(*_ANGLES[[max(0, best - 1), min(len(_ANGLES) - 1, best + 1)]], 41)
-        fine = [
-            (_misfit(normals, depth, replace(camera, fov=float(a)), columns, rows), a) for a in near
-        ]
-        other = off[-1] if widths > 0 else 1.0
-        (least, angle) = min(fine)
-        return f"--fov {angle:.3g}" if least < min(_FITS, other - _APART) else ""
-    return lenses[best][0] if off[best] < min(_FITS, min(off[:-1]) - _APART) else ""
+    near = np.linspace(*_ANGLES[[max(0, best - 1), min(len(_ANGLES) - 1, best + 1)]], 41)
+    least, angle = min((perspective(angle), angle) for angle in near)
+    width, flat = _width(normals, depth, *at, camera), 1.0
+    if width > 0:
+        parallel_rays = replace(camera, projection="orthographic", across=width)
+        flat = _misfit(normals, depth, parallel_rays, *at)
+    if min(least, flat) > _FITS or abs(least - flat) < _APART:
+        return "", 1.0
+    if flat < least:
+        return f"--projection orthographic --ortho-width {width:.3g}", flat
+    return f"--fov {angle:.3g}", least
 
 
 def _misfit(normals: Array, depth: Array, camera: Camera, columns: Any, rows: Any) -> float:
@@ -87,7 +97,7 @@ def _misfit(normals: Array, depth: Array, camera: Camera, columns: Any, rows: An
     return float(off) if facing > 0.9 else 1.0
 
 
-def _widths(normals: Array, depth: Array, columns: Any, rows: Any, camera: Camera) -> float:
+def _width(normals: Array, depth: Array, columns: Any, rows: Any, camera: Camera) -> float:
     """The width of an orthographic frame, by the weighted median of what each pair says."""
     mean = normals.sum(1)
     with np.errstate(all="ignore"):

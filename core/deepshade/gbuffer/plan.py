@@ -106,21 +106,20 @@ class Plan:
             for cause in (name, f"{name}_world"):
                 # derivable or not: falling back would be choosing among the candidates
                 if name not in self.choices and cause in self.ambiguous:
-                    raise self.ambiguous[cause]
+                    raise self._ambiguous(cause, needs)
         lacking = [name for name in needs if self.steps(name) is None]
         if not lacking:
             return
         for cause in ("depth", "distance", "position", "position_world", "normal_world"):
             if cause in self.ambiguous:
-                raise self.ambiguous[cause]
+                raise self._ambiguous(cause, needs)
         unmet = {name: derivation.unmet(name, self.choices, self.met) for name in lacking}
         missing = [name for name in lacking if not unmet[name]]
         if missing:
             found = [name for layer in self.layers for name in layer.channels]
             near = near_misses(self.layers, missing)
             enough = derivation.enough(missing)
-            by = self._writers(needs)
-            fix = " or ".join(f"if {name} wrote it: --profile {name}" for name in by)
+            fix = " or ".join(self._writers(needs))
             raise MissingAttributeError(missing, found, near, enough=enough, fix=fix)
         wanted = list(dict.fromkeys(need for name in lacking for need in unmet[name]))
         wide = self.projection == "orthographic"
@@ -136,17 +135,27 @@ class Plan:
             fix="; ".join(fixes),
         )
 
+    def _ambiguous(self, name: str, needs: Sequence[str]) -> AmbiguousChannelError:
+        error = self.ambiguous[name]
+        fixes = [*self._writers(needs), error.fix]
+        return AmbiguousChannelError(name, error.candidates, fix=" or ".join(fixes))
+
     def _writers(self, needs: Sequence[str]) -> list[str]:
-        """Renderers whose names would give all that is needed."""
+        """Fixes that name renderers whose names would give all that is needed."""
         found: list[str] = []
         for profile in PROFILES.values():
             if not profile.free_names or self.profile is not None:
                 continue
-            choices, _ = channels.choose(self.layers, self.wanted, profile, {})
+            named = [layer for layer in self.layers if layer.name in _names(profile)]
+            choices, _ = channels.choose(named, self.wanted, profile, {})
             met = self.met | {"fov", "matrix"}  # what else is missing is said then
             if all(derivation.plan(name, choices, met) is not None for name in needs):
-                found.append(profile.name)
+                found.append(f"if {profile.name} wrote it: --profile {profile.name}")
         return found
+
+
+def _names(profile: Profile) -> set[str]:
+    return {name for source in profile.sources for name in source.layers}
 
 
 def plan_gbuffer(

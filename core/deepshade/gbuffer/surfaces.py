@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from deepshade.camera import rotation_of
 from deepshade.errors import ContradictionError
 from deepshade.gbuffer.axes import AS_STORED, EVERY, Axes
-from deepshade.gbuffer.conventions import NORMALS
+from deepshade.gbuffer.conventions import NORMALS, Reading
 from deepshade.gbuffer.depths import MEANINGS, Kind
 from deepshade.gbuffer.examination import MIN_PAIRS, MOST, Examination
 from deepshade.gbuffer.guesses import fitting_lens
@@ -113,7 +113,7 @@ def _together(e: Examination, name: str, source: str, kinds: Sequence[Kind]) -> 
     e.clear &= bool(stated < least - _ALIKE)
     if facing > _SEEN and stated < least + _ALIKE:
         if stated > _UNLIKELY:
-            lens = _lens(e, name, source)
+            lens, _ = _lens(e, name, source)
             would = f"; with {lens} it would" if lens else ""
             e.warn(f"'{name}' hardly fits the surfaces that '{source}' shows{would}")
         return True
@@ -124,10 +124,12 @@ def _together(e: Examination, name: str, source: str, kinds: Sequence[Kind]) -> 
     return True
 
 
-def _lens(e: Examination, name: str, source: str) -> str:
-    """The options that ask for a lens with which both would go together; "" for none."""
-    if e.camera is None or (name, source) != ("normal", "depth"):
-        return ""
+def _lens(e: Examination, name: str, source: str) -> tuple[str, float]:
+    """The options that ask for a lens with which both would go together, as they are read so far,
+    and how little they misfit then; "" for none."""
+    readings = {e.reading(name), e.reading(source)}
+    if e.camera is None or (name, source) != ("normal", "depth") or readings != {Reading()}:
+        return "", 1.0
     return fitting_lens(e.arrays[name], e.arrays[source], e.camera)
 
 
@@ -146,15 +148,19 @@ def _settle(
         if facing < MOST
         else (f"'{name}' and '{source}' contradict each other")
     )
-    if not equals:
-        lens = _lens(e, name, source)
+    lens, off = _lens(e, name, source)
+    # a lens that fits much better than any axes: then it is the lens that is wrong
+    if not equals or off < equals[0][0] - _ALIKE:
         why = f"{seen}, and with no axes does it fit the surfaces that '{source}' shows"
+        if equals:
+            why = f"{seen} as this lens sees them"
         raise ContradictionError(
             f"{why}; with another lens it would" if lens else why,
             seen=seen,
             fits=[lens] if lens else [],
-            fix=f"{f'{lens}; ' if lens else ''}if it is of world space: --map normal_world=<layer>;"
-            f" to have it calculated from '{source}': --derive {name}",
+            fix=lens
+            or f"if it is of world space: --map normal_world=<layer>; to have it calculated from "
+            f"'{source}': --derive {name}",
         )
     _, axes, best = equals[0]
     alike = [
