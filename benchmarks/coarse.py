@@ -1,9 +1,9 @@
 """What coarse positions cost, as they are stored and repaired: DSSIM relative to exact ones.
 
-    python benchmarks/coarse.py ao=data/test-ao do=data/test-do [--views 9] [--step 60,30,15] [--json]
+    python benchmarks/coarse.py ao=data/test-ao do=data/test-do [--views 9] [--step 60,30,15]
 
 Positions are cut to steps of a share of the effect's radius, at an offset from the origin, once
-rounded and once cut off; the mean over views of each bundle's error, over that with exact positions.
+rounded and once cut off; the mean over views of each bundle's error, over that with exact ones.
 """
 
 from __future__ import annotations

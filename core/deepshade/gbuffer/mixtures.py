@@ -20,7 +20,7 @@ Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _WHOLE = 0.97  # length of normals that aren't mixed, and coverage of pixels that are whole
-_ROWS = 8  # every how many rows are looked at first
+_ROWS = 16  # every how many rows are looked at first
 _EDGE = 0.9  # coverage that pixels beside nothing have at most, where a filter was at work
 _INSIDE = 0.3  # share of all others that may be mixed all the same: other edges, bumps
 _LEAST = 8  # pixels beside nothing that tell
