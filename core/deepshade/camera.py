@@ -153,7 +153,7 @@ class Camera:
     ) -> NDArray[np.float64]:
         """Camera-space positions (3, ...) of some pixels at these depths (...)."""
         if self.projection == "orthographic":
-            return np.stack([*self._slopes(columns, rows), -depth])
+            return np.stack(np.broadcast_arrays(*self._slopes(columns, rows), -depth))
         return self.rays_at(columns, rows) * depth
 
     def _directions(

@@ -150,7 +150,7 @@ def _settle(
     )
     lens, off = _lens(e, name, source)
     # a lens that fits much better than any axes: then it is the lens that is wrong
-    if not equals or off < equals[0][0] - _ALIKE:
+    if not equals or off < equals[0][0] / 2:
         why = f"{seen}, and with no axes does it fit the surfaces that '{source}' shows"
         if equals:
             why = f"{seen} as this lens sees them"
