@@ -20,7 +20,7 @@ Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _WHOLE = 0.97  # length of normals that aren't mixed, and coverage of pixels that are whole
-_ROWS = 16  # every how many rows are looked at first
+_ROWS = 32  # so many rows at least are looked at first, and every 16th of a large picture
 _EDGE = 0.9  # coverage that pixels beside nothing have at most, where a filter was at work
 _INSIDE = 0.3  # share of all others that may be mixed all the same: other edges, bumps
 _LEAST = 8  # pixels beside nothing that tell
@@ -47,7 +47,8 @@ def unmix(arrays: Mapping[str, Float]) -> tuple[dict[str, str], str]:
     take what their whole neighbours say, the others show nothing. Without a whole neighbour in
     reach those beside nothing are divided by their coverage, and the others stay as they are.
     """
-    if not _filtered({name: array[:, ::_ROWS] for name, array in arrays.items()}):
+    step = min(16, max(1, next(iter(arrays.values())).shape[1] // _ROWS))
+    if not _filtered({name: array[:, ::step] for name, array in arrays.items()}):
         return {}, ""
     coverage, empty = _coverage(arrays)
     mixed = ~empty & (coverage < _WHOLE) & _near(empty | _cliffs(arrays, empty), _REACH)
@@ -89,7 +90,7 @@ def unmix(arrays: Mapping[str, Float]) -> tuple[dict[str, str], str]:
 
 def _filtered(some: Mapping[str, Float]) -> bool:
     """Whether the pixels beside nothing, in some rows, are mixed, and the others aren't."""
-    coverage, empty = _coverage(some)
+    coverage, empty = _coverage(some, vertical=False)
     left = np.zeros_like(empty)
     left[:, 1:] = empty[:, :-1]
     left[:, :-1] |= empty[:, 1:]
@@ -104,8 +105,11 @@ def _filtered(some: Mapping[str, Float]) -> bool:
     return np.count_nonzero(short & inside) <= _INSIDE * max(1, np.count_nonzero(inside))
 
 
-def _coverage(arrays: Mapping[str, Float]) -> tuple[Float, Mask]:
-    """(how much of each pixel (H, W) shows a surface, where nothing does)."""
+def _coverage(arrays: Mapping[str, Float], *, vertical: bool = True) -> tuple[Float, Mask]:
+    """(how much of each pixel (H, W) shows a surface, where nothing does).
+
+    Rows that don't lie beside each other aren't to be compared: not `vertical`.
+    """
     name = next((name for name in NORMALS if name in arrays), "")
     if name:
         normals = arrays[name]
@@ -117,18 +121,28 @@ def _coverage(arrays: Mapping[str, Float]) -> tuple[Float, Mask]:
         return np.ones(shape, np.float32), np.zeros(shape, np.bool_)
     depth = arrays[name][0]
     empty = ~((depth > 0) & (depth < FAR))
-    # the nearest surface in reach beside it: what falls off towards nothing is mixed with it
-    least = np.where(empty, np.inf, depth)
-    seen = np.full_like(least, np.inf)
-    for step in (-_REACH, _REACH):
-        shifted = np.full_like(least, np.inf)
-        if step > 0:
-            shifted[:, :-step] = least[:, step:]
-        else:
-            shifted[:, -step:] = least[:, :step]
-        seen = np.minimum(seen, shifted)
-    coverage = np.where(np.isfinite(seen), np.minimum(depth / seen, 1), 1)
-    return coverage.astype(np.float32), empty
+    # what falls off from a surface on the one side to nothing on the other is mixed with it
+    coverage = np.ones_like(depth)
+    for axis in (0, 1) if vertical else (1,):
+        for side in (1, -1):
+            beside = np.zeros_like(empty)
+            for far in range(1, _REACH + 1):
+                beside |= _shifted(empty, side * far, axis, False)
+            inner = _shifted(np.where(empty, np.nan, depth), -side * _REACH, axis, np.nan)
+            share = np.where(beside & (depth < inner), depth / inner, 1)
+            np.minimum(coverage, share, out=coverage)
+    return coverage, empty
+
+
+def _shifted(array: NDArray[Any], by: int, axis: int, fill: Any) -> NDArray[Any]:
+    """What lies `by` pixels further along the axis; `fill` past the end."""
+    moved = np.full_like(array, fill)
+    here, there = [slice(None)] * 2, [slice(None)] * 2
+    here[axis], there[axis] = slice(None, -by or None), slice(by, None)
+    if by < 0:
+        here[axis], there[axis] = slice(-by, None), slice(None, by)
+    moved[tuple(here)] = array[tuple(there)]
+    return moved
 
 
 def _cliffs(arrays: Mapping[str, Float], empty: Mask) -> Mask:
