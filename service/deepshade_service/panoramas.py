@@ -93,12 +93,13 @@ def _looking(
     there /= np.sqrt((there * there).sum(0))
     longitude = np.arctan2(there[0], -there[2])
     latitude = np.arcsin(np.clip(there[1], -1, 1))
-    columns = (longitude / (2 * math.pi) + 0.5) * around.width - around.x0
-    rows = (0.5 - latitude / math.pi) * around.height - around.y0
+    columns = np.floor((longitude / (2 * math.pi) + 0.5) * around.width) % around.width
+    rows = np.minimum(np.floor((0.5 - latitude / math.pi) * around.height), around.height - 1)
+    columns, rows = columns - around.x0, rows - around.y0
     height, width = gbuffer.shape
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    y = np.clip(rows.astype(np.intp), 0, height - 1)
-    x = np.clip(columns.astype(np.intp), 0, width - 1)
+    y = np.clip(rows, 0, height - 1).astype(np.intp)
+    x = np.clip(columns, 0, width - 1).astype(np.intp)
     empty = gbuffer.background[y, x] | ~inside
     attributes: dict[str, Float] = {}
     for name, array in gbuffer.attributes.items():
