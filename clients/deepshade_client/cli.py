@@ -72,6 +72,16 @@ def shade(
     ] = None,
     up: Annotated[Literal["y", "z"] | None, typer.Option(help="The world's up axis.")] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    projection: Annotated[
+        Literal["perspective", "orthographic", "latlong"] | None,
+        typer.Option(help="The camera's, where the header doesn't say."),
+    ] = None,
+    ortho_width: Annotated[
+        float | None, typer.Option(help="Width of an orthographic frame, scene units.")
+    ] = None,
+    view: Annotated[
+        str | None, typer.Option(help="Which view of a stereo file, or part of a file.")
+    ] = None,
     world_to_camera: Annotated[
         str | None,
         typer.Option(help="The camera's matrix: 16 numbers, row by row, for column vectors."),
@@ -177,6 +187,9 @@ def shade(
         rotate=rotate,
         up=up,
         fov=fov,
+        projection=projection,
+        ortho_width=ortho_width,
+        view=view,
         world_to_camera=world_to_camera,
         profile=profile,
         mapping=parse_mapping(map_ or []),

@@ -184,10 +184,11 @@ def as_options(text: str) -> str:
     """The service's text with "--fov 50" for "?fov=50"."""
 
     def option(parameter: re.Match[str]) -> str:
-        return f"--{parameter[1].replace('_', '-')}{' ' if parameter[2] else ''}"
+        blank = " " if parameter[0].startswith("&") else ""
+        return f"{blank}--{parameter[1].replace('_', '-')}{' ' if parameter[2] else ''}"
 
     text = re.sub(r"\?(strict|trust)=1", r"--\1", text)  # which take no value there
-    return re.sub(r"\?([a-z_]+)=(?=([\w<.])?)", option, text)
+    return re.sub(r"[?&]([a-z_]+)=(?=([\w<.])?)", option, text)
 
 
 def _print_error(console: Console, result: Result) -> None:

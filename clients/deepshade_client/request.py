@@ -43,7 +43,9 @@ class Options:
 
     `radius`, `focus` and `aperture` are in scene units, `shutter` in frames, `fov` is the full
     horizontal angle in degrees. `radius` may be a share of the median depth, "15%", which it is
-    without one. `world_to_camera` is the camera's matrix (4, 4), for column vectors, or its numbers
+    without one. `projection` is the camera's, where it isn't perspective; an orthographic frame is
+    `ortho_width` scene units wide. `view` is one of a stereo file, or a part of a file, by name.
+    `world_to_camera` is the camera's matrix (4, 4), for column vectors, or its numbers
     row by row as text. `mapping` says which layer or comma-separated channels hold an
     attribute, `half` asks for 16-bit pixels. `environment` names the map that lights the scene,
     `rotate` turns it, in degrees, and `up` is the world's up axis.
@@ -69,6 +71,9 @@ class Options:
     rotate: float | None = None
     up: Literal["y", "z"] | None = None
     fov: float | None = None
+    projection: Literal["perspective", "orthographic", "latlong"] | None = None
+    ortho_width: float | None = None
+    view: str | None = None
     world_to_camera: ArrayLike | str | None = None
     profile: str | None = None
     mapping: Mapping[str, str] | None = None

@@ -1,4 +1,4 @@
-"""The pinhole camera of an image: where its pixels are, and how world and camera space relate."""
+"""The camera of an image: where its pixels are, and how world and camera space relate."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,8 @@ from deepshade.errors import CameraError
 _STRIDE = 4  # every how many pixels normals are compared
 _FLAT = 1e-3  # share of a singular value that is rounding
 Window = tuple[int, int, int, int]
+Projection = Literal["perspective", "orthographic", "latlong"]
+PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
 # attribute -> (shape, least value)
 _PLACING: dict[str, tuple[tuple[int, ...], float | None]] = {
     "pixelAspectRatio": ((), float(np.finfo(np.float32).tiny)),
@@ -27,7 +29,7 @@ _PLACING: dict[str, tuple[tuple[int, ...], float | None]] = {
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera.
+    """A pinhole camera, or with another `projection` one whose rays are parallel, or go all around.
 
     Camera space is right-handed: +x right, +y up, looking down -z. `fov` is the full horizontal
     angle in degrees across the whole frame (the display window, `width` x `height` pixels).
@@ -36,6 +38,9 @@ class Camera:
     `center` is the optical axis' offset from the frame's middle (OpenEXR's screenWindowCenter,
     in units of the image plane at distance 1), for shifted lenses. `pixel_aspect` is a pixel's
     width divided by its height (OpenEXR's pixelAspectRatio): 2 for an anamorphic squeeze.
+    An "orthographic" frame is `across` scene units wide. A "latlong" frame spans the sphere: row 0
+    is up, the centre column -z, and columns to the right of it turn towards +x. Both leave out
+    `fov`.
     """
 
     fov: float
@@ -46,9 +51,19 @@ class Camera:
     y0: int = 0
     center: tuple[float, float] = (0.0, 0.0)
     pixel_aspect: float = 1.0
+    projection: Projection = "perspective"
+    across: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.fov) and 0.0 < self.fov < 180.0):
+        if self.projection == "orthographic":
+            if not (math.isfinite(self.across) and self.across > 0):
+                raise CameraError(
+                    f"an orthographic frame is {self.across} scene units wide, it must be above 0",
+                    fix="give its width in scene units: --ortho-width 10",
+                )
+        elif self.projection == "perspective" and not (
+            math.isfinite(self.fov) and 0.0 < self.fov < 180.0
+        ):
             raise CameraError(
                 f"the field of view is {self.fov}°, it must lie between 0 and 180",
                 fix="give the full horizontal angle in degrees: --fov 50",
@@ -106,50 +121,91 @@ class Camera:
     @property
     def pixels_per_unit(self) -> float:
         """Pixels that a horizontal length of 1 at distance 1 spans: (width / 2) / tan(fov / 2)."""
+        if self.projection != "perspective":
+            across = self.across if self.projection == "orthographic" else 2 * math.pi
+            return self.width / across
         return 0.5 * self.width / math.tan(math.radians(self.fov) / 2)
 
     def rays(self, width: int | None = None, height: int | None = None) -> NDArray[np.float32]:
         """Camera-space directions with z = -1 through the stored pixels' centres: (3, H, W).
 
-        `width` and `height` are those of the data window; the whole frame by default.
+        Of a latlong camera they have length 1 instead. `width` and `height` are those of the data
+        window; the whole frame by default.
         """
         width, height = width or self.width, height or self.height
+        columns, rows = np.arange(width), np.arange(height)[:, None]
         out = np.empty((3, height, width), np.float32)
-        out[0], out[1] = self._slopes(np.arange(width), np.arange(height)[:, None])
-        out[2] = -1.0
+        out[0], out[1], out[2] = self._directions(columns, rows)
         return out
 
     def rays_at(
         self, columns: NDArray[np.integer[Any]], rows: NDArray[np.integer[Any]]
     ) -> NDArray[np.float64]:
         """The same through some of the stored pixels, by their numbers (...): (3, ...)."""
-        x, y = self._slopes(columns, rows)
-        return np.stack([x, y, np.full(x.shape, -1.0)])
+        x, y, z = self._directions(columns, rows)
+        return np.stack(np.broadcast_arrays(x, y, z))
+
+    def points_at(
+        self,
+        columns: NDArray[np.integer[Any]],
+        rows: NDArray[np.integer[Any]],
+        depth: NDArray[np.floating[Any]],
+    ) -> NDArray[np.float64]:
+        """Camera-space positions (3, ...) of some pixels at these depths (...)."""
+        if self.projection == "orthographic":
+            return np.stack(np.broadcast_arrays(*self._slopes(columns, rows), -depth))
+        return self.rays_at(columns, rows) * depth
+
+    def _directions(
+        self, columns: NDArray[np.integer[Any]], rows: NDArray[np.integer[Any]]
+    ) -> tuple[Any, Any, Any]:
+        if self.projection == "orthographic":
+            return 0.0 * columns, 0.0 * rows, -1.0
+        if self.projection == "latlong":
+            turn = (columns + (self.x0 + 0.5 - 0.5 * self.width)) * (2 * math.pi / self.width)
+            rise = (0.5 * self.height - self.y0 - 0.5 - rows) * (math.pi / self.height)
+            return np.cos(rise) * np.sin(turn), np.sin(rise), -np.cos(rise) * np.cos(turn)
+        return *self._slopes(columns, rows), -1.0
 
     def _slopes(
         self, columns: NDArray[np.integer[Any]], rows: NDArray[np.integer[Any]]
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """x / -z and y / -z of the stored pixels' centres."""
+        """x and y of the stored pixels' centres at distance 1, of parallel rays at any."""
         scale = 1.0 / self.pixels_per_unit
         x = (columns + (self.x0 + 0.5 - 0.5 * self.width)) * scale + self.center[0]
         y = 0.5 * self.height - self.y0 - 0.5 - rows
         return x, y * (scale / self.pixel_aspect) + self.center[1]
 
     def position_from_depth(self, depth: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-        """P_s, (3, H, W), from planar depth (H, W) in scene units; non-finite depth stays so."""
-        out = self.rays(depth.shape[1], depth.shape[0])
+        """P_s, (3, H, W), from planar depth (H, W) in scene units; non-finite depth stays so.
+
+        A latlong camera has no plane: its depth is the distance.
+        """
+        height, width = depth.shape
+        if self.projection == "orthographic":
+            out = np.empty((3, height, width), np.float32)
+            out[0], out[1] = self._slopes(np.arange(width), np.arange(height)[:, None])
+            np.negative(depth, out=out[2])
+            return out
+        out = self.rays(width, height)
         with np.errstate(invalid="ignore", over="ignore"):  # 0 * inf on background pixels
             out *= np.asarray(depth, np.float32)
         return out
 
+    def slant(self, width: int, height: int) -> NDArray[np.float32]:
+        """The length of each stored pixel's ray: distance / depth, (H, W)."""
+        rays = self.rays(width, height)
+        return np.asarray(np.sqrt((rays * rays).sum(0)), np.float32)
+
     def to_header(self) -> dict[str, Any]:
         """The EXR attributes that `from_header` reads (the windows are the writer's)."""
-        header: dict[str, Any] = {
-            "deepshade:fov": float(self.fov),
+        header: dict[str, Any] = {"screenWindowCenter": tuple(float(c) for c in self.center)}
+        if self.projection == "perspective":
+            header["deepshade:fov"] = float(self.fov)
             # OpenEXR's screen window is the image plane at distance 1
-            "screenWindowWidth": 2.0 * math.tan(math.radians(self.fov) / 2),
-            "screenWindowCenter": tuple(float(c) for c in self.center),
-        }
+            header["screenWindowWidth"] = 2.0 * math.tan(math.radians(self.fov) / 2)
+        elif self.projection == "orthographic":
+            header["deepshade:ortho_width"] = float(self.across)
         if self.pixel_aspect != 1.0:
             header["pixelAspectRatio"] = float(self.pixel_aspect)
         if self.world_to_camera is not None:
@@ -180,16 +236,37 @@ class Camera:
             fov = math.degrees(2.0 * math.atan(screen_width / 2))
         if fov is None:
             return None
+        matrix = matrix_from_header(attributes)
+        return cls.framed(attributes, data_window, display_window, matrix, fov=float(fov))
+
+    @classmethod
+    def framed(
+        cls,
+        attributes: Mapping[str, Any],
+        data_window: Window,
+        display_window: Window,
+        matrix: NDArray[np.float64] | None,
+        *,
+        fov: float = 0.0,
+        projection: Projection = "perspective",
+        across: float = 0.0,
+    ) -> Camera:
+        """A camera of this lens, with the windows and the shape of pixels that a header states.
+
+        Raises CameraError for a lens that is none.
+        """
         aspect = _number(attributes.get("pixelAspectRatio"))
         return cls(
-            fov=float(fov),
+            fov=fov,
             width=display_window[2] - display_window[0] + 1,
             height=display_window[3] - display_window[1] + 1,
-            world_to_camera=matrix_from_header(attributes),
+            world_to_camera=matrix,
             x0=data_window[0] - display_window[0],
             y0=data_window[1] - display_window[1],
             center=_pair(attributes.get("screenWindowCenter")),
             pixel_aspect=aspect if aspect is not None and aspect > 0 else 1.0,
+            projection=projection,
+            across=across,
         )
 
 
@@ -202,9 +279,20 @@ def matrix_from_header(attributes: Mapping[str, Any]) -> NDArray[np.float64] | N
         matrix = np.asarray(value, np.float64).reshape(4, 4).T
     except (TypeError, ValueError):
         raise CameraError("the header's worldToCamera is no 4 x 4 matrix") from None
-    if matrix[3, :3].any() and not matrix[:3, 3].any():
-        matrix = matrix.T  # pbrt writes it as it multiplies columns
-    return _checked_matrix(matrix)
+    return _checked_matrix(matrix.T if _by_columns(matrix) else matrix)
+
+
+def matrix_of(value: Any) -> NDArray[np.float64] | None:
+    """`matrix_from_header` of a value; None where it is none, or can't be inverted."""
+    try:
+        return None if value is None else matrix_from_header({"worldToCamera": value})
+    except CameraError:
+        return None
+
+
+def _by_columns(matrix: NDArray[np.float64]) -> bool:
+    """Whether it was written as it multiplies columns, as pbrt does."""
+    return bool(matrix[3, :3].any() and not matrix[:3, 3].any())
 
 
 def parse_matrix(text: str) -> NDArray[np.float64]:

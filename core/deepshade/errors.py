@@ -57,13 +57,14 @@ class MissingAttributeError(DeepshadeError):
         *,
         why: Mapping[str, str] | None = None,
         enough: str = "",
+        fix: str = "",
     ) -> None:
         near = {name: tuple(close) for name, close in (near or {}).items() if close}
         reasons = {name: f" ({why[name]})" for name in missing if why and why.get(name)}
         lacking = ", ".join(f"'{name}'{reasons.get(name, '')}" for name in missing)
         super().__init__(
             f"missing {lacking}; channels found: {_shortened(found) or 'none'}",
-            fix=_mapping_hint(missing, near, enough),
+            fix=fix or _mapping_hint(missing, near, enough),
         )
         self.enough = enough
         self.missing = tuple(missing)
@@ -74,10 +75,10 @@ class MissingAttributeError(DeepshadeError):
 class AmbiguousChannelError(DeepshadeError):
     """Several channels could be the same attribute; deepshade never guesses."""
 
-    def __init__(self, attribute: str, candidates: Sequence[str]) -> None:
+    def __init__(self, attribute: str, candidates: Sequence[str], *, fix: str = "") -> None:
         super().__init__(
             f"'{attribute}' could be any of: {_shortened(candidates)}",
-            fix=f"choose one: --map {attribute}={candidates[0]}",
+            fix=fix or f"choose one: --map {attribute}={candidates[0]}",
         )
         self.attribute = attribute
         self.candidates = tuple(candidates)
@@ -122,12 +123,14 @@ class SceneError(DeepshadeError):
 class ConfigError(DeepshadeError):
     """A setting has an unknown name or an impossible value."""
 
-    def __init__(self, key: str, known: Iterable[str] = (), *, detail: str = "") -> None:
+    def __init__(
+        self, key: str, known: Iterable[str] = (), *, detail: str = "", fix: str = ""
+    ) -> None:
         self.key = key
         self.nearest = nearest(key, known)
         super().__init__(
             detail or f"unknown setting '{key}'",
-            fix=f"did you mean '{self.nearest}'?" if self.nearest else "",
+            fix=fix or (f"did you mean '{self.nearest}'?" if self.nearest else ""),
         )
 
 

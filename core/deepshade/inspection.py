@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.console import Console
 
+    from deepshade.camera import Projection
     from deepshade.exr import Limits
     from deepshade.gbuffer.conventions import Conventions
     from deepshade.gbuffer.plan import Plan
@@ -35,6 +36,16 @@ def inspect(
         str | None, typer.Option(help="The renderer whose names and conventions to use.")
     ] = None,
     fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    projection: Annotated[
+        Literal["perspective", "orthographic", "latlong"] | None,
+        typer.Option(help="The camera's, where the header doesn't say."),
+    ] = None,
+    ortho_width: Annotated[
+        float | None, typer.Option(help="Width of an orthographic frame, scene units.")
+    ] = None,
+    view: Annotated[
+        str | None, typer.Option(help="Which view of a stereo file, or part of a file.")
+    ] = None,
     axes: Annotated[
         list[str] | None,
         typer.Option(help="Stored axes, as position:x,-y,-z or opencv; repeatable."),
@@ -78,6 +89,9 @@ def inspect(
         mapping=parse_mapping(map_ or ()),
         profile=profile,
         fov=fov,
+        projection=projection,
+        ortho_width=ortho_width,
+        view=view,
         matrix=matrix,
         conventions=parse_conventions(axes or (), normals, depth, near, far),
     )
@@ -97,18 +111,22 @@ def inspect_files(
     mapping: Mapping[str, str] | None = None,
     profile: str | None = None,
     fov: float | None = None,
+    projection: Projection | None = None,
+    ortho_width: float | None = None,
+    view: str | None = None,
     matrix: NDArray[np.float64] | None = None,
     limits: Limits | None = None,
     conventions: Conventions | None = None,
 ) -> dict[str, Any]:
     """The report on files of one view, as plain JSON values.
 
-    Keys: files (parts, channels, windows), profile, camera, mapped, ambiguous, effects (for each:
-    ready, bundles, have, derived, missing), statistics, and checks (derived, warnings, and the
-    contradiction with its fix, if there is one). `matrix` is worldToCamera (4, 4), for column
-    vectors, in place of the header's. An effect is ready when a bundle of it is installed
-    whose inputs are there or can be derived. Raises what `load_gbuffer` raises for files
-    that can't be read, but not for missing or ambiguous attributes: those are the report.
+    Keys: files (parts, channels, windows), profile, views and the one shown, camera, mapped,
+    ambiguous, effects (for each: ready, bundles, have, derived, missing), statistics, and checks
+    (derived, warnings, and the contradiction with its fix, if there is one). `matrix` is
+    worldToCamera (4, 4), for column vectors, in place of the header's. An effect is ready when a
+    bundle of it is installed whose inputs are there or can be derived. Raises what `load_gbuffer`
+    raises for files that can't be read, but not for missing or ambiguous attributes: those are the
+    report.
     """
     from deepshade import exr
     from deepshade.attributes import ATTRIBUTES
@@ -123,12 +141,24 @@ def inspect_files(
         for part in (part for header in headers for part in header.parts):
             part.attributes["worldToCamera"] = matrix.T
     stems, wanted = [path.stem for path in paths], list(ATTRIBUTES)
-    plan = plan_gbuffer(headers, stems, wanted, profile=profile, mapping=mapping, fov=fov)
+    seen: dict[str, Any] = {
+        "profile": profile,
+        "mapping": mapping,
+        "fov": fov,
+        "projection": projection,
+        "view": view,
+    }
+    plan = plan_gbuffer(headers, stems, wanted, **seen, across=ortho_width)
     return {
         "files": [_file(path, header) for path, header in zip(paths, headers, strict=True)],
         "profile": plan.profile.name if plan.profile else None,
+        "views": list(plan.views.names),
+        "view": plan.views.read or None,
         "camera": {
-            "fov": plan.camera.fov if plan.camera else None,
+            "projection": plan.projection,
+            "fov": (plan.camera.fov or None) if plan.camera else None,
+            "ortho_width": (plan.camera.across or None) if plan.camera else None,
+            "unusable": dict(plan.unusable),
             "world_to_camera": plan.matrix.tolist() if plan.matrix is not None else None,
         },
         "mapped": {name: str(choice) for name, choice in plan.choices.items()},
@@ -141,9 +171,8 @@ def inspect_files(
         "checks": _checks(
             plan,
             list(zip([path.name for path in paths], bodies, strict=True)),
-            profile=profile,
-            mapping=mapping,
-            fov=fov,
+            **seen,
+            ortho_width=ortho_width,
             limits=limits,
             headers=headers,
             conventions=conventions,
@@ -283,12 +312,16 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
         for index, part in enumerate(file["parts"]):
             name = f"{_safe(part['name'] or str(index))}: " if len(file["parts"]) > 1 else ""
             console.print(f"  {name}{_size(part)}: {_safe(_listed(part['channels']))}")
-    fov = report["camera"]["fov"]
+    camera = report["camera"]
     console.print(
-        f"renderer: {report['profile'] or 'not recognised'}; "
-        f"field of view: {f'{fov:.4g}°' if fov else 'unknown'}; "
-        f"worldToCamera: {'yes' if report['camera']['world_to_camera'] else 'no'}"
+        f"renderer: {report['profile'] or 'not recognised'}; {_lens(camera)}; "
+        f"worldToCamera: {'yes' if camera['world_to_camera'] else 'no'}"
     )
+    for why in camera["unusable"].values():
+        console.print(f"[yellow]not used:[/yellow] {_safe(why)}")
+    if len(report["views"]) > 1:
+        read = f"; this is of {report['view']}" if report["view"] else ""
+        console.print(f"views: {_safe(', '.join(report['views']))}{_safe(read)}")
 
     table = Table("attribute", "from", "non-finite", "values")
     for name, where in report["mapped"].items():
@@ -318,6 +351,16 @@ def _show(report: Mapping[str, Any], console: Console) -> None:
             state = "[red]missing[/red]" if effect["bundles"] else "[red]no bundle here[/red]"
         table.add_row(name, state, _safe(_lacks(effect["missing"])))
     console.print(table)
+
+
+def _lens(camera: Mapping[str, Any]) -> str:
+    if camera["projection"] == "latlong":
+        return "latitude-longitude panorama"
+    if camera["projection"] == "orthographic":
+        width = camera["ortho_width"]
+        return f"orthographic, {f'{width:.4g}' if width else 'unknown'} wide"
+    fov = camera["fov"]
+    return f"field of view: {f'{fov:.4g}°' if fov else 'unknown'}"
 
 
 def _size(part: Mapping[str, Any]) -> str:

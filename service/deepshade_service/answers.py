@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from deepshade import exr, pictures
 from deepshade.effects import EFFECTS
+from deepshade.exr.entries import Entry
 from deepshade.gbuffer import GBuffer
 from deepshade_service.composition import Composition
 from deepshade_service.parameters import ShadeParameters
@@ -25,7 +27,10 @@ _STAGES = ("decode", "plan", "infer", "encode")
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """How one effect was made: as facts and as a plan, of how many pixels, in what time."""
+    """How one effect was made: as facts and as a plan, of how many pixels, in what time.
+
+    `view` is that of the files, where several were asked for.
+    """
 
     effect: str
     facts: Facts
@@ -33,6 +38,7 @@ class Made:
     pixels: int
     computed: int
     milliseconds: Mapping[str, float]
+    view: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +52,19 @@ class Shaded:
 
     @property
     def facts(self) -> Mapping[str, Any]:
-        """Those of its effect, or of each, by its name."""
-        if len(self.made) == 1:
-            return self.made[0].facts
-        names = ",".join(each.effect for each in self.made)
-        return {"effects": names} | {each.effect: each.facts for each in self.made}
+        """Those of its effect, or of each, by its name; of several views those of the first."""
+        first = _first_view(self.made)
+        views: dict[str, Any] = {}
+        if len(self.made) > len(first):
+            warned = [
+                f"{m.view}: {m.facts['warnings']}" for m in self.made if "warnings" in m.facts
+            ]
+            views["views"] = ",".join(dict.fromkeys(made.view for made in self.made))
+            views |= {"warnings": "; ".join(warned)} if warned else {}
+        if len(first) == 1:
+            return first[0].facts | views
+        names = ",".join(each.effect for each in first)
+        return {"effects": names} | {each.effect: each.facts for each in first} | views
 
     @property
     def stages(self) -> dict[str, float]:
@@ -60,9 +74,10 @@ class Shaded:
         for each in self.made:
             for stage, ms in each.milliseconds.items():
                 stages[stage] += ms
-                single[f"{stage}-{each.effect}"] = ms
+                name = f"{stage}-{each.effect}"
+                single[name] = single.get(name, 0.0) + ms
         stages = {name: ms for name, ms in stages.items() if ms}
-        return stages if len(self.made) == 1 else stages | single
+        return stages if len({each.effect for each in self.made}) == 1 else stages | single
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +87,11 @@ class Place:
     attributes: Mapping[str, Any]
     data_window: exr.Window
     display_window: exr.Window
+
+    @property
+    def windows(self) -> tuple[exr.Window, exr.Window]:
+        """Both windows."""
+        return self.data_window, self.display_window
 
     @classmethod
     def of(cls, gbuffer: GBuffer) -> Place:
@@ -107,13 +127,21 @@ def encode(
     channels = dict(own)
     attributes = {**composition.attributes, **place.attributes}
     alone = f"{composition.layer}." if composition.layer else ""
+    several = len(_first_view(made)) > 1
     for shade, each in zip(shades, made, strict=True):
-        layer, key = (f"{each.effect}.", f"{each.effect}:") if len(made) > 1 else (alone, "")
+        layer, key = (f"{each.effect}.", f"{each.effect}:") if several else (alone, "")
+        if each.view != made[0].view:  # a view's name stands last (MultiViewOpenEXR)
+            layer, key = f"{layer}{each.view}.", f"{key}{each.view}:"
         names = EFFECTS[each.effect].outputs if composition.shade else ()
         channels |= {f"{layer}{name}": plane for name, plane in zip(names, shade, strict=False)}
         attributes |= {f"deepshade:{key}{name}": value for name, value in each.facts.items()}
-    if len(made) > 1:
-        attributes["deepshade:effects"] = ",".join(each.effect for each in made)
+    if several:
+        attributes["deepshade:effects"] = ",".join(each.effect for each in _first_view(made))
+    if len(made) > len(_first_view(made)):
+        attributes.pop("view", None)
+        views = dict.fromkeys(each.view.encode() for each in made)
+        packed = b"".join(struct.pack("<i", len(name)) + name for name in views)
+        attributes["multiView"] = Entry("stringvector", packed)
     attributes["deepshade:plan"] = plan
     floats = {
         name for name in channels if not (composition.own[name].half if name in own else asked.half)
@@ -132,5 +160,12 @@ def encode(
 
 
 def plan_of(made: Sequence[Made]) -> Json:
-    """The plan of an effect, or of each by its name."""
+    """The plan of an effect, or of each by its name; of several views those of each."""
+    views = dict.fromkeys(each.view for each in made)
+    if len(views) > 1:
+        return {view: plan_of([each for each in made if each.view == view]) for view in views}
     return made[0].plan if len(made) == 1 else {each.effect: each.plan for each in made}
+
+
+def _first_view(made: Sequence[Made]) -> list[Made]:
+    return [each for each in made if each.view == made[0].view]

@@ -58,6 +58,9 @@ def decode(
         profile=asked.profile,
         mapping=asked.mapping,
         fov=asked.fov,
+        projection=asked.projection,
+        ortho_width=asked.ortho_width,
+        view=asked.view,
         limits=limits,
         headers=headers,
         anew=(*(name.value for name in asked.derive), *(("focal",) if new_lens else ())),
@@ -76,15 +79,25 @@ def decode(
             for name in error.missing
         }
         raise MissingAttributeError(
-            error.missing, error.found, error.near, why=users, enough=error.enough
+            error.missing, error.found, error.near, why=users, fix=error.fix
         ) from None
 
 
 def _shuttered(gbuffer: GBuffer, effect: Effect, asked: ShadeParameters) -> GBuffer:
     """The G-buffer, its motion scaled to the shutter that is asked for."""
     setting = SETTINGS["shutter"]
-    if asked.shutter is None or not effect.takes(setting):
+    if not effect.takes(setting):
         return gbuffer
+    if asked.shutter is None:
+        if not gbuffer.per_frame:
+            return gbuffer
+        why = (
+            "the motion is that of the whole interval between two frames, and how much of it the"
+            " shutter is open isn't known: ?shutter=0.5 is half of it"
+        )
+        if asked.strict:
+            raise Problem(422, "contradiction", why, fix="say it: ?shutter=0.5")
+        return replace(gbuffer, warnings=(*gbuffer.warnings, why))
     shutter = stored(gbuffer, setting)
     if not shutter:
         raise Problem(

@@ -38,6 +38,7 @@ from deepshade.gbuffer.depths import KINDS, MEANINGS
 from deepshade.gbuffer.profiles import PROFILES
 from deepshade_service.problems import Problem
 
+MAX_VIEWS = 8  # in one answer
 LENS = ("focus", "aperture")  # settings from which the blur circle is derived
 CAMERA = (*LENS, "shutter")
 LIGHT = ("environment", "rotate", "up")
@@ -116,6 +117,30 @@ class ShadeParameters(BaseModel):
             allow_inf_nan=False,
             description="Full horizontal field of view in degrees, where positions have to be"
             " derived from depth and the header doesn't say.",
+        ),
+    ] = None
+    projection: Annotated[
+        Literal["perspective", "orthographic", "latlong"] | None,
+        Field(
+            description="How the camera projects; else what the header says, else `perspective`."
+            " `orthographic` needs `ortho_width`, `latlong` is a panorama all around."
+        ),
+    ] = None
+    ortho_width: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            allow_inf_nan=False,
+            description="Width of an orthographic camera's frame in scene units.",
+        ),
+    ] = None
+    view: Annotated[
+        str | None,
+        Field(
+            max_length=200,
+            description="Which view of a stereo or multi-view file, as `left`, or which part by its"
+            " name; else the file's default one. Several, as `left,right`, are answered in one"
+            " multi-view EXR.",
         ),
     ] = None
     profile: Annotated[
@@ -294,6 +319,17 @@ class ShadeParameters(BaseModel):
         return None if self.world_to_camera is None else parse_matrix(self.world_to_camera)
 
     @property
+    def views(self) -> list[str]:
+        """The views that are asked for; none where it is left to the file."""
+        names = [name.strip() for name in (self.view or "").split(",")]
+        return list(dict.fromkeys(filter(None, names)))
+
+    @property
+    def orthographic(self) -> bool:
+        """Whether a camera with parallel rays is asked for."""
+        return self.projection == "orthographic" or self.ortho_width is not None
+
+    @property
     def mapping(self) -> dict[str, str]:
         """`map` as attribute -> channel or layer."""
         return parse_mapping(self.map)
@@ -312,6 +348,35 @@ class ShadeParameters(BaseModel):
                 f"{asked} {'has' if len(effects) == 1 else 'have'} no setting '{name}'",
                 fix=f"leave out ?{name}=; it is a setting of {', '.join(having)}",
                 effects=having,
+            )
+        if len(self.views) > 1 and (self.append or self.multiply or self.format == "png"):
+            name = "append" if self.append else "multiply" if self.multiply else "format"
+            raise Problem(
+                422,
+                "bad-parameter",
+                f"?{name}= is for one view, and several were asked for",
+                fix=f"leave out ?{name}=, or ask for one ?view= at a time",
+            )
+        if len(self.views) > MAX_VIEWS:
+            raise Problem(
+                422,
+                "bad-parameter",
+                f"{len(self.views)} views are more than the {MAX_VIEWS} that one answer may hold",
+                fix="ask for fewer at a time: ?view=left",
+            )
+        if self.ortho_width is not None and self.projection not in (None, "orthographic"):
+            raise Problem(
+                422,
+                "bad-parameter",
+                f"ortho_width is of an orthographic camera, not of a {self.projection} one",
+                fix="leave out ?ortho_width= or ?projection=",
+            )
+        if self.fov is not None and self.orthographic:
+            raise Problem(
+                422,
+                "bad-parameter",
+                "an orthographic camera has no field of view",
+                fix="leave out ?fov=; ?ortho_width= is the frame's width in scene units",
             )
         if self.strict and self.trust:
             raise Problem(

@@ -15,6 +15,7 @@ from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.environments import Environment, Up
 from deepshade.gbuffer import GBuffer
 from deepshade_service.parameters import CAMERA, ShadeParameters
+from deepshade_service.problems import as_query
 from deepshade_service.radius import Radius
 from deepshade_service.selection import Selection
 from deepshade_service.tiles import Tile
@@ -87,7 +88,8 @@ def explain(
         "dssim": bundle.dssim,
         **_settings(gbuffer, bundle.effect, plan),
         "derived": _derived(gbuffer, plan),
-        "warnings": [*gbuffer.warnings, *filter(None, [plan.radius.warning])],
+        "warnings": [as_query(warning, type(asked).model_fields) for warning in gbuffer.warnings]
+        + list(filter(None, [plan.radius.warning])),
         "pixels": {
             "width": width,
             "height": height,

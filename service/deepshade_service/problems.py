@@ -64,19 +64,23 @@ def from_error(error: DeepshadeError, parameters: Collection[str]) -> Problem:
     if isinstance(error, LimitError) and error.limit in _OPTIONS:
         option = _OPTIONS[error.limit]
         fix = f"send a smaller picture, or start the service with a higher {option}"
-    detail = _as_query(str(error), parameters)
-    return Problem(status, kind, detail, fix=_as_query(fix, parameters), **facts_of(error))
+    detail = as_query(str(error), parameters)
+    facts = facts_of(error)
+    if "fits" in facts:
+        facts["fits"] = [as_query(option, parameters) for option in facts["fits"]]
+    return Problem(status, kind, detail, fix=as_query(fix, parameters), **facts)
 
 
-def _as_query(text: str, parameters: Collection[str]) -> str:
-    """The text with "?fov=50" for "--fov 50"."""
+def as_query(text: str, parameters: Collection[str]) -> str:
+    """The text with "?fov=50&view=left" for "--fov 50 --view left"."""
 
     def query(option: re.Match[str]) -> str:
         name = option[1].replace("-", "_")
         value = "1" if name in _SWITCHES else ""
         return f"?{name}={value}" if name in parameters else option[0]
 
-    return re.sub(r"--([a-z][a-z-]*)(?: (?=[\w<]))?", query, text)
+    text = re.sub(r"--([a-z][a-z-]*)(?: (?=[\w<]))?", query, text)
+    return re.sub(r"(\?[a-z_]+=[^\s;]*[^\s;,]) \?(?=[a-z_]+=)", r"\1&", text)
 
 
 def respond(problem: Problem) -> JSONResponse:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from math import prod
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from deepshade.engines import Engine
 from deepshade.environments import Prepared
 from deepshade.gbuffer import GBuffer
 from deepshade.machine import trim
+from deepshade_service import panoramas
 from deepshade_service.answers import Made, Place, Shaded, encode, plan_of
 from deepshade_service.composition import Composition, bytes_of, compose
 from deepshade_service.decoding import decode, read_headers
@@ -89,26 +91,34 @@ class Shader:
             shades: list[Float] = []
             made: list[Made] = []
             bundles = [job.bundle for job in jobs]
-            gbuffers = decode(files, headers, bundles, asked, self.limits)
             composition: Composition | None = None
-            for job in jobs:
-                if cancelled.is_set():
-                    raise Cancelled
-                with watch.time("decode"):
-                    gbuffer = next(gbuffers)
-                place = Place.of(gbuffer)
-                if composition is None:
-                    effects = [EFFECTS[bundle.effect] for bundle in bundles]
-                    composition = compose(files, headers, asked, effects, gbuffer)
-                shade, how = run(job, gbuffer, headers, asked, held, cancelled)
-                shades.append(shade)
-                made.append(replace(how, facts=how.facts | composition.facts))
-                del gbuffer  # the next may be decoded anew
+            place: Place | None = None
+            for view in asked.views or [""]:
+                of_view = asked.model_copy(update={"view": view}) if view else asked
+                gbuffers = decode(files, headers, bundles, of_view, self.limits)
+                for job in jobs:
+                    if cancelled.is_set():
+                        raise Cancelled
+                    with watch.time("decode"):
+                        gbuffer = next(gbuffers)
+                    here = Place.of(gbuffer)
+                    place = place or here
+                    if here.windows != place.windows:
+                        raise _other_pixels()
+                    if composition is None:
+                        effects = [EFFECTS[bundle.effect] for bundle in bundles]
+                        composition = compose(files, headers, asked, effects, gbuffer)
+                    shade, how = run(job, gbuffer, headers, asked, held, cancelled)
+                    shades.append(shade)
+                    facts = how.facts | composition.facts
+                    several = len(asked.views) > 1
+                    made.append(replace(how, facts=facts, view=view if several else ""))
+                    del gbuffer  # the next may be decoded anew
+                gbuffers.close()  # what they share is no longer needed
             if asked.explain:
                 content = json.dumps(plan_of(made), indent=2).encode()
                 return Shaded(content, "application/json", made, watch.milliseconds)
-            gbuffers.close()  # what they share is no longer needed
-            assert composition is not None, "there is at least one effect"
+            assert composition is not None and place is not None, "there is at least one effect"
             with watch.time("decode"):
                 own = composition.read(files, headers)
             with watch.time("encode"):
@@ -129,7 +139,7 @@ class Shader:
         jobs = []
         for selection in selections:
             bundle = selection.bundle
-            more = bytes_of(headers, asked)
+            more = bytes_of(headers, asked) + _more(headers, asked, bundles)
             need = need_of(headers, bundle, self.memory.total, bundles, more)
             prepared = await self._environment(bundle, asked)
             engine = None if asked.explain else await self.models.engine(bundle, selection.backend)
@@ -179,7 +189,10 @@ def run(
     `held` is the memory that the request holds. Raises what the steps raise.
     """
     watch, bundle = Stopwatch(), job.bundle
+    around = panoramas.is_panorama(gbuffer)
     with watch.time("plan"):
+        if around:
+            panoramas.check(bundle)
         plan = plan_shading(gbuffer, bundle, asked, job.need.max_pixels)
         if job.prepared is not None:
             plan = lit(plan, job.prepared, gbuffer, bundle, asked)
@@ -191,7 +204,10 @@ def run(
     shade = np.empty((0, 0, 0), np.float32)
     if job.engine is not None:
         with watch.time("infer"):
-            shade = infer(gbuffer, plan, job.engine, cancelled)
+            if around:
+                shade = _around(job, gbuffer, plan, asked, cancelled)
+            else:
+                shade = infer(gbuffer, plan, job.engine, cancelled)
         if held > _BIG:
             job.engine.shrink()  # for the next one
     pixels = gbuffer.background.size
@@ -210,7 +226,8 @@ def plan_shading(
     tiles = tuple(grid)
     if EFFECTS[bundle.effect].background != "shaded":
         tiles = tuple(tile for tile in tiles if not gbuffer.background[tile.answered].all())
-    return ShadePlan(radius_of(gbuffer, bundle, asked), grid.shape, tiles)
+    sized = panoramas.measured(gbuffer) if panoramas.is_panorama(gbuffer) else gbuffer
+    return ShadePlan(radius_of(sized, bundle, asked), grid.shape, tiles)
 
 
 def lit(
@@ -258,6 +275,51 @@ def infer(gbuffer: GBuffer, plan: ShadePlan, engine: Engine, cancelled: threadin
             fix="report it with the picture; another ?radius= or ?bundle= may work",
         )
     return shade
+
+
+def _around(
+    job: Job,
+    gbuffer: GBuffer,
+    plan: ShadePlan,
+    asked: ShadeParameters,
+    cancelled: threading.Event,
+) -> Float:
+    """`infer` of a panorama, by the views that it is cut into."""
+    assert job.engine is not None, "what is only planned isn't inferred"
+    effect = EFFECTS[job.bundle.effect]
+    shade = np.empty((len(effect.outputs), *gbuffer.shape), np.float32)
+    for face in panoramas.faces(gbuffer):
+        part = plan_shading(face.gbuffer, job.bundle, asked, job.need.max_pixels)
+        part = replace(part, radius=plan.radius)
+        if job.prepared is not None:
+            part = lit(part, job.prepared, face.gbuffer, job.bundle, asked)
+        shade[:, face.of] = infer(face.gbuffer, part, job.engine, cancelled)[:, *face.at]
+    if effect.background == "light":
+        np.copyto(shade, gbuffer.attributes["light"], where=gbuffer.background)
+    elif effect.background != "shaded":
+        np.copyto(shade, np.float32(effect.background), where=gbuffer.background)
+    return shade
+
+
+def _more(headers: Sequence[exr.Header], asked: ShadeParameters, bundles: Sequence[Bundle]) -> int:
+    """Bytes that further views' answers take, and the views that a panorama is cut into."""
+    outputs = sum(len(EFFECTS[bundle.effect].outputs) for bundle in bundles)
+    further = 12 * outputs * max(0, len(asked.views) - 1)
+    around = [part.attributes.get("envmap") == 0 for header in headers for part in header.parts]
+    inputs = {name for bundle in bundles for name in bundle.inputs}
+    faces = 8 * tensors.channel_count(inputs, per_channel=False)
+    if asked.projection != "latlong" and not any(around):
+        faces = 0
+    return (further + faces) * prod(size_of(headers))
+
+
+def _other_pixels() -> Problem:
+    return Problem(
+        422,
+        "unusable-input",
+        "the views cover different pixels, which one picture can't hold",
+        fix="ask for one ?view= at a time",
+    )
 
 
 def _stopping() -> Problem:

@@ -105,6 +105,34 @@ RENDERERS = {
         HEADER | {"worldToCamera": (FLIP @ CAMERA.matrix).T},
     ),
     "vray": (layer("normals", N, "RGB") | {"zDepth": Z}, HEADER),
+    "3delight": (
+        layer("P.camera", P) | layer("N.camera", N) | {"z": Z},
+        HEADER | {"Software": "3Delight 2.9"},
+    ),
+    "mantra": (
+        layer("P", P) | layer("N", N) | {"Pz": Z},
+        HEADER | {"Software": "mantra 20.5"},
+    ),
+    "karma": (
+        layer("P", P_WORLD) | layer("N", N_WORLD) | {"Pz": Z},
+        HEADER | {"renderTime_s": "0.34", "renderMemory_s": "683 MB"},
+    ),
+    "luxcore": (
+        layer("POSITION", P_WORLD, "RGB")
+        | layer("SHADING_NORMAL", N_WORLD, "RGB")
+        | {"DEPTH.Y": np.sqrt((P * P).sum(0))},
+        HEADER | {"Software": "LuxCoreRender 2.9"},
+    ),
+    "blenderproc": (  # encoded, and nothing is (0, 0, 0)
+        layer("normals", np.where(HIT, N / 2 + 0.5, 0).astype("f"), "RGB") | {"depth.V": Z},
+        HEADER | {"Software": "BlenderProc 2.7"},
+    ),
+    "replicator": (
+        layer("normals", N_WORLD)
+        | layer("PtWorldPos", P_WORLD)
+        | {"distance_to_image_plane": Z, "distance_to_camera": np.sqrt((P * P).sum(0))},
+        HEADER | {"Software": "Omniverse Replicator"},
+    ),
 }
 
 
@@ -115,6 +143,41 @@ def test_renderers(name, named):
     gbuffer = load_gbuffer(encode(channels, header), NEEDS, profile=name if named else None)
     check(gbuffer)
     assert set(gbuffer.derived) <= {"normal", "position"}
+
+
+@pytest.mark.parametrize(
+    "channels",
+    [
+        {"distance": np.sqrt((P * P).sum(0))},
+        {"Pz": Z},
+        layer("P_camera", P),
+        {"depth.left.Z": Z},  # the only view
+        {"Z.left.V": Z},
+    ],
+)
+def test_what_people_call_them(channels):
+    check(load_gbuffer(encode(channels | layer("N_camera", N)), NEEDS))
+
+
+@pytest.mark.parametrize("letters", ["Y", "V", "L", "RGB"])
+def test_a_grey_file_is_about_its_name(letters):
+    depth = encode(dict.fromkeys(letters, Z))
+    normal = encode(layer("", N, "RGB"))
+    check(load_gbuffer([("shot_depth.0007.exr", depth), ("shot_normal.0007.exr", normal)], NEEDS))
+    check(load_gbuffer([("depth.exr", depth), ("normal.exr", normal)], NEEDS))
+
+
+def test_motion_of_a_whole_frame_s_interval():
+    vector = dict(zip("XYZW", np.float32([5, 6, 7, 8])[:, None, None] + 0 * P[:1], strict=True))
+    channels = {f"ViewLayer.Vector.{name}": plane for name, plane in vector.items()}
+    gbuffer = load_gbuffer(encode(channels), ("motion",))
+    assert gbuffer.attributes["motion"][:, 20, 20].tolist() == [7, -8]
+    assert gbuffer.per_frame
+    assert gbuffer.header["deepshade:shutter"] == 1
+    said = load_gbuffer(encode(channels, HEADER | {"deepshade:shutter": 0.5}), ("motion",))
+    assert not said.per_frame
+    own = load_gbuffer(encode(layer("motion", P[:2], "UV")), ("motion",))
+    assert not own.per_frame
 
 
 def test_unreal_world_is_left_handed_centimetres():

@@ -2,7 +2,7 @@
 
 An answer keeps those of its input, byte for byte. The names and types are OpenEXR's optional
 standard attributes (openexr.com/en/latest/StandardAttributes.html) without those that say how
-pixels are stored or placed, and what Blender stamps into its files.
+pixels are stored or where they lie, and what Blender stamps into its files.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 _MAX_TEXT = 2**16  # bytes; a frame's comments, but no manifest
 _LAYOUTS = {
+    "envmap": "<B",
     "int": "<i",
     "float": "<f",
     "v2f": "<2f",
@@ -33,6 +34,7 @@ _NAMES = {
         isoSpeed shutterAngle tStop cameraCCTSetting cameraTintSetting sensorPhotositePitch
         nominalFocalLength pinholeFocalLength effectiveFocalLength entrancePupilOffset""",
     "int": "imageCounter",
+    "envmap": "envmap",
     "v2f": "adoptedNeutral cameraColorBalance sensorCenterOffset sensorOverallDimensions",
     "box2i": "sensorAcquisitionRectangle",
     "m44f": "worldToNDC",

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from deepshade.errors import AmbiguousChannelError, ConfigError, MissingAttributeError
-from deepshade.exr import Header
+from deepshade.exr import Header, Part
+from deepshade.gbuffer import views
 from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, Profile, Source, match_rank
+from deepshade.gbuffer.views import Views
 
 _WORDS = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
 _COMPONENTS = {letter: letter for letter in "xyzwrgbauvt"} | _WORDS
@@ -25,6 +28,7 @@ class Layer:
 
     file: int
     name: str
+    part: int = 0
     from_stem: bool = False
     components: dict[str, list[str]] = field(default_factory=dict)
 
@@ -50,7 +54,9 @@ class Layer:
             return None
         doubled = [c for c in complete[0] if len(self.components[c]) > 1]
         if doubled or (count == 3 and len(complete) > 1):
-            raise AmbiguousChannelError(quantity, self.channels)
+            listed = ",".join(self.components[letter][0] for letter in complete[0])
+            fix = f"name its channels: --map {quantity}={listed}"
+            raise AmbiguousChannelError(quantity, self.channels, fix=fix)
         return tuple(self.components[letter][0] for letter in complete[0])
 
 
@@ -63,6 +69,7 @@ class Choice:
     channels: tuple[str, ...]
     signs: tuple[int, ...] = ()
     profile: str = ""
+    per_frame: bool = False
 
     def __str__(self) -> str:
         names = ", ".join(self.channels)
@@ -82,23 +89,46 @@ def parse_mapping(pairs: Iterable[str]) -> dict[str, str]:
     return mapping
 
 
-def layers(headers: Sequence[Header], stems: Sequence[str]) -> list[Layer]:
-    """Groups every channel of every file into layers. `stems` are the file names ("" if none)."""
+def layers(
+    headers: Sequence[Header], stems: Sequence[str], view: Views | None = None
+) -> list[Layer]:
+    """Groups the channels of each file, or of one `view` in them, into layers.
+
+    `stems` are the file names ("" if none).
+    """
+    view = view or Views()
     found: dict[tuple[int, int, str], Layer] = {}
     for file, (header, stem) in enumerate(zip(headers, stems, strict=True)):
-        bare = [{n.lower() for n in part.channels if "." not in n} for part in header.parts]
-        for qualified, (part, channel) in header.channels().items():
-            layer, component = _split(channel, bare[part])
-            key = (file, part, layer)
+        mine: list[tuple[str, int, str]] = []  # of the view: qualified name, part, name in it
+        for qualified, (at, channel) in header.channels().items():
+            part = header.parts[at]
+            if views.holds(view, channel, part):
+                mine.append(
+                    (qualified, at, views.split(channel, part)[1] if view.read else channel)
+                )
+        bare = [
+            {name.lower() for _, at, name in mine if at == part and "." not in name}
+            for part in range(len(header.parts))
+        ]
+        for qualified, at, channel in mine:
+            layer, component = _split(channel, bare[at])
+            key = (file, at, layer)
             if key not in found:
-                name = layer or (header.parts[part].name if len(header.parts) > 1 else "")
-                found[key] = Layer(file, name)
+                part = header.parts[at]
+                name = layer or (_part_name(part, view) if len(header.parts) > 1 else "")
+                found[key] = Layer(file, name, at)
             found[key].components.setdefault(component, []).append(qualified)
         own = [layer for (at, _, _), layer in found.items() if at == file and layer.name != "A"]
         # a file that holds one nameless layer, or grey, is about what its own name says
         if len(own) == 1 and own[0].name in ("", "Y", "V", "L") and stem:
             own[0].name, own[0].from_stem = stem, True
     return list(found.values())
+
+
+def _part_name(part: Part, view: Views) -> str:
+    """A part's name, which stands for its nameless layer, without the view's."""
+    name = re.sub(rf"[._ ]?{re.escape(view.read)}$", "", part.name) if view.read else ""
+    return name or part.name
 
 
 def choose(
@@ -204,8 +234,14 @@ def _search(
                 raise AmbiguousChannelError(
                     quantity,
                     [f"{', '.join(channels)} as {q.name} writes {s.quantity}" for q, s in options],
+                    fix="say what it is: "
+                    + " or ".join(
+                        f"--map {q}={layer.name}" for q in {s.quantity: 0 for _, s in options}
+                    )
+                    if len({s.quantity for _, s in options}) > 1
+                    else "say by whom: " + " or ".join(f"--profile {q.name}" for q, _ in options),
                 )
-            choice = Choice(quantity, layer.file, channels, source.signs, p.name)
+            choice = Choice(quantity, layer.file, channels, source.signs, p.name, source.per_frame)
             found.append((rank, layer, choice))
             break
     if not found:
@@ -213,7 +249,9 @@ def _search(
     best = min(rank for rank, _, _ in found)
     equals = [(layer, choice) for rank, layer, choice in found if rank == best]
     if len(equals) > 1:
-        raise AmbiguousChannelError(quantity, [layer.name for layer, _ in equals])
+        same = len({layer.name for layer, _ in equals}) < len(equals)
+        names = [choice.channels[0] if same else layer.name for layer, choice in equals]
+        raise AmbiguousChannelError(quantity, names)
     return equals[0][1]
 
 

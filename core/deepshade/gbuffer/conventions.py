@@ -134,7 +134,6 @@ def apply(readings: Mapping[str, Reading], arrays: dict[str, Float], camera: Cam
         if reading.kind == "distance":
             if camera is None:
                 continue  # it only marks the background
-            rays = camera.rays(*arrays[name].shape[:0:-1])
-            slant = np.sqrt((rays * rays).sum(0))
+            slant = camera.slant(*arrays[name].shape[:0:-1])
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             arrays[name] = reading.of(arrays[name], slant)

@@ -28,9 +28,14 @@ def check_planes(kind: Kind | None, near: float | None, far: float | None) -> No
         raise ConfigError(
             "near",
             detail=f"'{kind}' depth ({MEANINGS[kind]}) needs the planes' depths near and far",
+            fix="give them: --near <depth> and --far <depth>",
         )
     if near is not None and far is not None and not 0 < near < far:
-        raise ConfigError("near", detail=f"near ({near:g}) must be above 0 and below far ({far:g})")
+        raise ConfigError(
+            "near",
+            detail=f"near ({near:g}) must be above 0 and below far ({far:g})",
+            fix="give both planes' depths: --near <depth> and --far <depth>",
+        )
 
 
 @np.errstate(divide="ignore", invalid="ignore", over="ignore")

@@ -28,7 +28,8 @@ _REQUIREMENTS: dict[Requirement, str] = {
     "lens": "the field of view and the lens (deepshade:focus and deepshade:aperture)",
 }
 REQUIREMENT_FIXES: dict[Requirement, str] = {
-    "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov",
+    "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov; of a camera "
+    "with parallel rays the frame's width in scene units (--ortho-width)",
     "matrix": "give it (--world-to-camera), or write the standard header attribute worldToCamera",
     "lens": "give the full horizontal angle, the focus distance and the aperture's diameter, or "
     "write deepshade:fov, deepshade:focus and deepshade:aperture",
@@ -85,9 +86,7 @@ def _position_from_world(s: Source) -> Array:
 
 def _position_from_distance(s: Source) -> Array:
     distance = s.arrays["distance"][0]
-    rays = s.view.rays(distance.shape[1], distance.shape[0])
-    rays *= distance / np.sqrt((rays * rays).sum(0))  # |ray| >= 1, as its z is -1
-    return rays
+    return s.view.position_from_depth(distance / s.view.slant(*distance.shape[::-1]))
 
 
 def _view(s: Source) -> Array:
@@ -226,7 +225,8 @@ def requirements(
     camera: Camera | None, matrix: NDArray[np.float64] | None, header: Mapping[str, Any]
 ) -> set[Requirement]:
     """Which requirements the camera and header fulfil."""
-    lens = camera is not None and lens_of(header) is not None
+    pinhole = camera is not None and camera.projection == "perspective"
+    lens = pinhole and lens_of(header) is not None
     there = {"fov": camera is not None, "matrix": matrix is not None, "lens": lens}
     return {name for name in _REQUIREMENTS if there[name]}
 

@@ -1,82 +1,34 @@
-"""The G-buffer: per-pixel attributes of one view, loaded from EXR files of any renderer."""
+"""Loads G-buffers from EXR files of any renderer: plans, reads, checks, derives."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, Literal, cast
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
-from deepshade.camera import Camera, placement_of
-from deepshade.errors import ConfigError, ImageError, MissingAttributeError
+from deepshade.camera import Projection
+from deepshade.errors import CameraError, ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
 from deepshade.exr.entries import Entry
 from deepshade.gbuffer import background, channels, derivation
 from deepshade.gbuffer.checks import Verdict, examine
 from deepshade.gbuffer.conventions import Conventions, apply
+from deepshade.gbuffer.gbuffer import GBuffer
+from deepshade.gbuffer.guesses import suggestion
+from deepshade.gbuffer.lenses import number
+from deepshade.gbuffer.mixtures import unmix
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
-from deepshade.gbuffer.profiles import QUANTITIES, number
+from deepshade.gbuffer.poses import find_pose
+from deepshade.gbuffer.reading import Read, Source, fetch, read_choices
 from deepshade.gbuffer.repair import repair
 from deepshade.gbuffer.sources import passed_over
 
-Source = Path | str | bytes | tuple[str, bytes]
-# quantities that were read to choose between them, and whether they hold NaN or infinities
-_Read = dict[channels.Choice, tuple[NDArray[np.float32], bool]]
-
-
-@dataclass(slots=True)
-class GBuffer:
-    """Attributes of one view, ready for a network.
-
-    `attributes` maps names to (C, H, W) float32, C-contiguous; where `background` (H, W) is true
-    all are 0 but those that say something of it (`Attribute.in_background`). `nonfinite` counts
-    the pixels that held NaN or infinities (an infinite depth is a renderer's way to say
-    background and doesn't count). `mapped` tells which channels each quantity came from,
-    `decoded` all that were read for that, as (file, channel), and `derived` how the others were
-    computed, or how what is there had to be read; `warnings` say what looks unlikely. The
-    windows, (x0, y0, x1, y1) inclusive, are those of the part that the attributes came from,
-    `part_header` its own attributes, `entries` those of the shot; `header` holds those of all
-    parts and files, the first of each name. `up` is the world's up axis, as its renderer has it.
-    """
-
-    attributes: dict[str, NDArray[np.float32]]
-    background: NDArray[np.bool_]
-    camera: Camera | None = None
-    nonfinite: int = 0
-    mapped: dict[str, str] = field(default_factory=dict)
-    decoded: tuple[tuple[int, str], ...] = ()
-    derived: dict[str, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    header: dict[str, Any] = field(default_factory=dict)
-    part_header: dict[str, Any] = field(default_factory=dict)
-    entries: dict[str, Entry] = field(default_factory=dict)
-    data_window: exr.Window = (0, 0, 0, 0)
-    display_window: exr.Window = (0, 0, 0, 0)
-    up: Literal["y", "z"] = "y"
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width)."""
-        return cast(tuple[int, int], self.background.shape)
-
-    def placement(self) -> dict[str, Any]:
-        """EXR attributes that, beside the windows, put an answer exactly where its input lies.
-
-        Pixel aspect, screen window and worldToCamera: the camera's, or without one (no field of
-        view is known) what the part's header says of them, as far as it is usable. The matrix is
-        the header's own, where it has one, whichever way its camera looks.
-        """
-        said = placement_of(self.part_header)
-        camera = self.camera.to_header() if self.camera else {}
-        if "worldToCamera" in said:
-            camera.pop("worldToCamera", None)
-        return said | camera
+SHUTTER = "deepshade:shutter"
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +57,9 @@ def load_gbuffers(
     profile: str | None = None,
     mapping: Mapping[str, str] | None = None,
     fov: float | None = None,
+    projection: Projection | None = None,
+    ortho_width: float | None = None,
+    view: str | None = None,
     limits: Limits | None = None,
     headers: Sequence[Header] | None = None,
     anew: Collection[str] = (),
@@ -115,7 +70,9 @@ def load_gbuffers(
 
     A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
     (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
-    comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
+    comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees, of
+    another `projection` an orthographic one is `ortho_width` scene units wide. `view` names one of
+    the views of stereo files, or a part; without it the default one is read.
     What isn't there, or is to be `anew`, is derived (`derivation`): `GBuffer.derived` says how.
     `conventions` say how values are stored, and which checks they have to pass (`checks`).
     Positions whose steps are coarse beside the `radius` (by default the header's) are smoothed.
@@ -134,26 +91,43 @@ def load_gbuffers(
     for name in every:
         if name not in ATTRIBUTES:
             raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called '{name}'")
-    stems, bodies = _fetch(sources, limits)
+    stems, bodies = fetch(sources, limits)
     headers = headers or [exr.read_header(body, limits) for body in bodies]
     limits.check("parts", sum(len(header.parts) for header in headers))
     limits.check("channels", sum(len(p.channels) for header in headers for p in header.parts))
     limits.check("decoded_bytes", sum(header.decoded_bytes for header in headers))
 
-    read: _Read = {}
+    read: Read = {}
 
     def reader(choices: Mapping[str, channels.Choice]) -> Mapping[str, NDArray[np.float32]]:
         missing = {name: c for name, c in choices.items() if c not in read}
-        arrays, suspects = _read(bodies, headers, missing, limits, {})
+        arrays, suspects = read_choices(bodies, headers, missing, limits, {})
         read.update({missing[name]: (arrays[name], name in suspects) for name in missing})
         return {name: read[choice][0] for name, choice in choices.items()}
 
     def plan(wanted: Sequence[str]) -> Plan:
-        found = plan_gbuffer(headers, stems, wanted, profile=profile, mapping=mapping, fov=fov)
+        found = plan_gbuffer(
+            headers,
+            stems,
+            wanted,
+            profile=profile,
+            mapping=mapping,
+            fov=fov,
+            projection=projection,
+            across=ortho_width,
+            view=view,
+        )
+        find_pose(found, conventions, reader)
         found.passed_over = passed_over(found, mapping or {}, conventions, reader)
         for name in (*anew, *found.passed_over):
             found.choices.pop(name, None)
-        found.require(wanted)
+        try:
+            found.require(wanted)
+        except CameraError as error:
+            if lens := suggestion(found, reader):
+                detail = f"{error}; depth and normals go together with {lens}"
+                raise CameraError(detail, fix=f"{lens}; else {error.fix}") from None
+            raise
         return found
 
     try:
@@ -194,7 +168,7 @@ def _load(
     bodies: Sequence[bytes],
     headers: Sequence[Header],
     limits: Limits,
-    read: _Read,
+    read: Read,
 ) -> Generator[GBuffer]:
     """The jobs' G-buffers: together if they are then what they are alone, else one by one."""
     loaded = _together(jobs, bodies, headers, limits, read) if _agree(jobs) else None
@@ -204,6 +178,9 @@ def _load(
         return
     arrays, empty, nonfinite, verdict = loaded
     for job in jobs:
+        motion = job.choices.get("motion")
+        # without a shutter's time of its own it is open throughout
+        per_frame = motion is not None and motion.per_frame and SHUTTER not in job.plan.attributes
         yield GBuffer(
             attributes={name: arrays[name] for name in job.needs},
             background=empty,
@@ -213,12 +190,13 @@ def _load(
             decoded=tuple((c.file, name) for c in job.choices.values() for name in c.channels),
             derived=_said(job, verdict),
             warnings=tuple(verdict.warnings),
-            header=job.plan.attributes,
+            header={SHUTTER: 1.0} | job.plan.attributes if per_frame else job.plan.attributes,
             part_header=job.part.attributes,
-            entries=job.part.entries,
+            entries=_entries(job),
             data_window=job.part.data_window,
             display_window=job.part.display_window,
             up=job.plan.profile.up if job.plan.profile else "y",
+            per_frame=per_frame,
         )
 
 
@@ -248,7 +226,7 @@ def _together(
     bodies: Sequence[bytes],
     headers: Sequence[Header],
     limits: Limits,
-    read: _Read,
+    read: Read,
 ) -> tuple[dict[str, NDArray[np.float32]], NDArray[np.bool_], int, Verdict] | None:
     """(the attributes of all jobs, the background, how many pixels held NaN or infinities, what
     the checks found).
@@ -256,13 +234,19 @@ def _together(
     None where a job's background or count would be another's.
     """
     choices = {name: choice for job in jobs for name, choice in job.choices.items()}
-    arrays, suspects = _read(bodies, headers, choices, limits, read)
+    arrays, suspects = read_choices(bodies, headers, choices, limits, read)
     verdict = _checked(jobs, choices, arrays)
+    if jobs[0].conventions.checks != "trust":
+        notes, warning = unmix(arrays)
+        for name, note in notes.items():
+            verdict.note(name, note)
+        if warning:
+            verdict.warn(warning, jobs[0].conventions)
     if len(jobs) > 1 and not background.same(arrays, suspects, [job.choices for job in jobs]):
         return None
     empty, nonfinite = background.remove(arrays, suspects)
     plan = jobs[0].plan
-    if jobs[0].conventions.checks != "trust":
+    if jobs[0].conventions.checks != "trust" and plan.projection in (None, "perspective"):
         reach = jobs[0].radius or number(plan.attributes, "deepshade:radius")
         mended = repair(arrays, ~empty, plan.camera, plan.matrix, reach if reach > 0 else None)
         for name, note in mended.items():
@@ -292,33 +276,20 @@ def _checked(
 
 def _said(job: _Job, verdict: Verdict) -> dict[str, str]:
     """How what the job needs was derived, and how what that came from had to be read."""
-    derived = {name: job.plan.how(step) for name, step in job.steps.items()}
+    view = {"view": note} if (note := job.plan.views.note) else {}
+    derived = view | {name: job.plan.how(step) for name, step in job.steps.items()}
     for name, note in verdict.notes.items():
         if name in job.choices:
             derived[name] = f"{derived[name]}; {note}" if name in derived else note
     return derived
 
 
-def source_name(field: str, filename: str) -> str:
-    """What a form's file is called: its field if that names a quantity, else its file name."""
-    return f"{field}.exr" if field in QUANTITIES else filename
-
-
-def _fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str], list[bytes]]:
-    if isinstance(sources, str | bytes | Path) or (
-        isinstance(sources, tuple) and [type(item) for item in sources] == [str, bytes]
-    ):
-        sources = [cast(Source, sources)]
-    stems, bodies, total = [], [], 0
-    for source in sources:
-        name = source[0] if isinstance(source, tuple) else source
-        stems.append("" if isinstance(name, bytes) else Path(name).stem)
-        bodies.append(source[1] if isinstance(source, tuple) else exr.fetch(source, limits))
-        total += len(bodies[-1])
-        limits.check("body_bytes", total)
-    if not bodies:
-        raise ImageError("no image was given", fix="name at least one EXR file")
-    return stems, bodies
+def _entries(job: _Job) -> dict[str, Entry]:
+    """What an answer keeps of the part's header, and which view it is of."""
+    views = job.plan.views
+    if "view" in job.part.entries or not (views.read in views.names and views.note):
+        return job.part.entries
+    return job.part.entries | {"view": Entry("string", views.read.encode())}
 
 
 def _derive(
@@ -346,40 +317,3 @@ def _derive(
         surfaces = [a for name, a in arrays.items() if not background.in_background(name)]
         background.clear(surfaces, ~source.valid)
     return ~source.valid, grown
-
-
-def _read(
-    bodies: Sequence[bytes],
-    headers: Sequence[Header],
-    choices: Mapping[str, channels.Choice],
-    limits: Limits,
-    read: _Read,
-) -> tuple[dict[str, NDArray[np.float32]], set[str]]:
-    """(the chosen quantities, which of them hold NaN or infinities).
-
-    What was `read` before is taken from there: arrays are worked on in place.
-    """
-    arrays: dict[str, NDArray[np.float32]] = {}
-    suspects: set[str] = set()
-    for index, (body, header) in enumerate(zip(bodies, headers, strict=True)):
-        mine = {name: choice for name, choice in choices.items() if choice.file == index}
-        for name in [name for name in mine if mine[name] in read]:
-            arrays[name], suspect = read.pop(mine.pop(name))
-            suspects |= {name} if suspect else set()
-        if not mine:
-            continue
-        wanted = [channel for choice in mine.values() for channel in choice.channels]
-        image = exr.read(body, wanted, limits, header=header)
-        users = Counter(channel for choice in mine.values() for channel in set(choice.channels))
-        for name, choice in mine.items():
-            array = image.stack(choice.channels)
-            # attributes that share a channel don't share its memory: each has signs of its own
-            if any(users[channel] > 1 for channel in choice.channels):
-                array = array.copy()
-            for plane, sign in zip(array, choice.signs, strict=False):
-                if sign < 0:
-                    np.negative(plane, out=plane)
-            arrays[name] = array
-            if not image.nonfinite.isdisjoint(choice.channels):
-                suspects.add(name)
-    return arrays, suspects

@@ -118,6 +118,13 @@ def projection(
     return right, down
 
 
+def parallel(points: Array, reach: float) -> tuple[Array, Array]:
+    """(depths (...), rays (3, ...) with z = -1) of camera-space points (3, ...) that parallel rays
+    see, from so far back that they nearly are."""
+    depth = reach - points[2]
+    return depth, np.stack([points[0] / depth, points[1] / depth, np.full(depth.shape, -1.0)])
+
+
 def _line(values: Array, pixels: NDArray[np.intp]) -> Line | None:
     """The line of `values` over `pixels`, if they lie on one, but for a few."""
     span = float(pixels.max() - pixels.min())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,16 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deepshade import exr
-from deepshade.camera import Camera, matrix_from_header
+from deepshade.camera import Camera, Projection, matrix_from_header
 from deepshade.errors import AmbiguousChannelError, CameraError, ImageError, MissingAttributeError
 from deepshade.exr import Header
-from deepshade.gbuffer import channels, derivation
-from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, Profile, detect, number
+from deepshade.gbuffer import channels, derivation, views
+from deepshade.gbuffer.lenses import LATLONG, Lens, lens_in
+from deepshade.gbuffer.profiles import PROFILES, QUANTITIES, Profile, detect
 from deepshade.gbuffer.profiles import profile as profile_named
 from deepshade.gbuffer.suggestions import near_misses
+from deepshade.gbuffer.views import Views
 
 MARKERS = ("depth", "distance", "alpha")  # read, where there, to know the background
 
+_RAYS = {"orthographic": "the width of the frame", "latlong": "the rays of a panorama"}
 ABSENT = "not there"  # why an attribute can't be had, when nothing would make it derivable
 
 
@@ -33,10 +35,15 @@ class Plan:
     choices: dict[str, channels.Choice]
     ambiguous: dict[str, AmbiguousChannelError]
     profile: Profile | None
-    camera: Camera | None
-    matrix: NDArray[np.float64] | None
     attributes: dict[str, Any]
+    views: Views = field(default_factory=Views)
+    camera: Camera | None = None
+    matrix: NDArray[np.float64] | None = None
+    projection: Projection | None = None  # as far as it is known, even where its width isn't
+    unusable: dict[derivation.Requirement, str] = field(default_factory=dict)  # why
     passed_over: dict[str, str] = field(default_factory=dict)  # quantity -> why
+    wanted: tuple[str, ...] = ()  # all that what is needed could come from
+    pose: str = ""  # how the matrix was found, if no header has it
 
     def steps(self, attribute: str) -> list[derivation.Derivation] | None:
         """Derivations that lead to `attribute`; [] if it is in the files, None if impossible."""
@@ -79,11 +86,16 @@ class Plan:
 
     def how(self, step: derivation.Derivation) -> str:
         """How a derivation gets its attribute, and what it had to pass over."""
+        how = step.how
+        if step.requires == "fov" and self.projection in _RAYS:
+            how = how.replace("the field of view", _RAYS[self.projection])
         if step.target == "normal" and "position" in step.needs and "normal_world" in self.choices:
-            return f"{step.how} (the world-space normals there need worldToCamera)"
+            return f"{how} (the world-space normals there need worldToCamera)"
+        if self.pose and step.requires == "matrix":
+            return f"{how} ({self.pose})"
         if step.target == "position" and self.passed_over:
-            return f"{step.how} ({'; '.join(self.passed_over.values())})"
-        return step.how
+            return f"{how} ({'; '.join(self.passed_over.values())})"
+        return how
 
     def require(self, needs: Sequence[str]) -> None:
         """Raises what stands in the way of `needs`; returns if nothing does.
@@ -94,25 +106,56 @@ class Plan:
             for cause in (name, f"{name}_world"):
                 # derivable or not: falling back would be choosing among the candidates
                 if name not in self.choices and cause in self.ambiguous:
-                    raise self.ambiguous[cause]
+                    raise self._ambiguous(cause, needs)
         lacking = [name for name in needs if self.steps(name) is None]
         if not lacking:
             return
         for cause in ("depth", "distance", "position", "position_world", "normal_world"):
             if cause in self.ambiguous:
-                raise self.ambiguous[cause]
+                raise self._ambiguous(cause, needs)
         unmet = {name: derivation.unmet(name, self.choices, self.met) for name in lacking}
         missing = [name for name in lacking if not unmet[name]]
         if missing:
             found = [name for layer in self.layers for name in layer.channels]
             near = near_misses(self.layers, missing)
-            raise MissingAttributeError(missing, found, near, enough=derivation.enough(missing))
+            enough = derivation.enough(missing)
+            fix = " or ".join(self._writers(needs))
+            raise MissingAttributeError(missing, found, near, enough=enough, fix=fix)
         wanted = list(dict.fromkeys(need for name in lacking for need in unmet[name]))
+        wide = self.projection == "orthographic"
+        needed = derivation.requirement_text(wanted)
+        fixes = [derivation.REQUIREMENT_FIXES[name] for name in wanted]
+        if wide and "fov" in wanted:
+            needed = needed.replace(derivation.requirement_text(["fov"]), "the frame's width")
+            fixes[wanted.index("fov")] = "give it in scene units (--ortho-width)"
+        why = "; ".join(self.unusable[name] for name in wanted if name in self.unusable)
         raise CameraError(
             f"{', '.join(map(repr, lacking))} could be derived from what is there, but that needs "
-            f"{derivation.requirement_text(wanted)}",
-            fix="; ".join(derivation.REQUIREMENT_FIXES[name] for name in wanted),
+            f"{needed}{f' ({why})' if why else ''}",
+            fix="; ".join(fixes),
         )
+
+    def _ambiguous(self, name: str, needs: Sequence[str]) -> AmbiguousChannelError:
+        error = self.ambiguous[name]
+        fixes = [*self._writers(needs), error.fix]
+        return AmbiguousChannelError(name, error.candidates, fix=" or ".join(fixes))
+
+    def _writers(self, needs: Sequence[str]) -> list[str]:
+        """Fixes that name renderers whose names would give all that is needed."""
+        found: list[str] = []
+        for profile in PROFILES.values():
+            if not profile.free_names or self.profile is not None:
+                continue
+            named = [layer for layer in self.layers if layer.name in _names(profile)]
+            choices, _ = channels.choose(named, self.wanted, profile, {})
+            met = self.met | {"fov", "matrix"}  # what else is missing is said then
+            if all(derivation.plan(name, choices, met) is not None for name in needs):
+                found.append(f"if {profile.name} wrote it: --profile {profile.name}")
+        return found
+
+
+def _names(profile: Profile) -> set[str]:
+    return {name for source in profile.sources for name in source.layers}
 
 
 def plan_gbuffer(
@@ -123,11 +166,16 @@ def plan_gbuffer(
     profile: str | None = None,
     mapping: Mapping[str, str] | None = None,
     fov: float | None = None,
+    projection: Projection | None = None,
+    across: float | None = None,
+    view: str | None = None,
 ) -> Plan:
     """Maps the channels of files, by their headers alone, to what `needs` could come from.
 
-    `stems` are the files' names without suffix ("" where unknown). Raises CameraError,
-    ConfigError, and MissingAttributeError for a mapping to a channel that isn't there.
+    `stems` are the files' names without suffix ("" where unknown). Of the camera `fov` (degrees),
+    the `projection` and the width `across` an orthographic frame override what headers say; `view`
+    is one of the files' views, or a part's name. Raises CameraError, ConfigError, and
+    MissingAttributeError for a mapping to a channel that isn't there.
     """
     attributes: dict[str, Any] = {}
     for header in headers:
@@ -135,17 +183,34 @@ def plan_gbuffer(
             for key, value in part.attributes.items():
                 attributes.setdefault(key, value)
     known = profile_named(profile) if profile else detect(attributes)
-    layers = channels.layers(headers, stems)
+    seen = views.choose(headers, view)
+    layers = channels.layers(headers, stems, seen)
     wanted = list(dict.fromkeys((*needs, *_related(needs), *MARKERS)))
     choices, ambiguous = channels.choose(layers, wanted, known, mapping or {})
     for choice in choices.values():
         if known is None and choice.profile not in ("", "deepshade"):
             known = PROFILES[choice.profile]  # for its handedness: the names gave it away
-    matrix = _matrix(attributes, known)
-    plan = Plan(list(headers), layers, choices, ambiguous, known, None, matrix, attributes)
-    part = plan.parts(next(iter(choices.values())))[0] if choices else headers[0].parts[0]
-    plan.camera = _camera(part, attributes, known, fov, matrix)
+    plan = Plan(list(headers), layers, choices, ambiguous, known, attributes, seen)
+    plan.wanted = tuple(wanted)
+    for name, error in ambiguous.items():
+        if fix := _view_fix(plan, error):
+            ambiguous[name] = AmbiguousChannelError(name, error.candidates, fix=fix)
+    _see(plan, needs, fov, projection, across)
     return plan
+
+
+def _view_fix(plan: Plan, error: AmbiguousChannelError) -> str:
+    """Which views to read one of, where candidates differ by them; "" where they don't."""
+    names: Sequence[str] = plan.views.names if not plan.views.read else ()
+    if len(names) < 2:
+        places = [
+            at for h in plan.headers for n, at in h.channels().items() if n in error.candidates
+        ]
+        parts = {part: plan.headers[0].parts[part].name for part, _ in places}
+        names = [name for name in parts.values() if name] if len(plan.headers) == 1 else ()
+    if len(names) < 2 or plan.views.read:
+        return ""
+    return "read one view: " + " or ".join(f"--view {name}" for name in names[:8])
 
 
 def _related(needs: Sequence[str]) -> list[str]:
@@ -160,6 +225,62 @@ def _related(needs: Sequence[str]) -> list[str]:
     return related
 
 
+def _facts(plan: Plan, needs: Sequence[str]) -> dict[str, Any]:
+    """The attributes of the parts that are shaded, never another part's or view's.
+
+    Files of one part belong to the view that they are sent as.
+    """
+    direct = [plan.choices[name] for name in needs if name in plan.choices]
+    rest = [c for c in plan.choices.values() if c.quantity not in ("alpha", "beauty")]
+    whole = len(direct) == len(needs)
+    parts = [part for c in (direct if whole else direct + rest) for part in plan.parts(c)]
+    if not parts:
+        parts = [part for header in plan.headers for part in header.parts]
+    parts += [header.parts[0] for header in plan.headers if len(header.parts) == 1]
+    facts: dict[str, Any] = {}
+    for part in parts:
+        facts = part.attributes | facts
+    return facts
+
+
+def _see(
+    plan: Plan,
+    needs: Sequence[str],
+    fov: float | None,
+    projection: Projection | None,
+    across: float | None,
+) -> None:
+    """Adds the camera, as far as it is known; what can't be used of a header blocks nothing yet."""
+    facts = plan.attributes = _facts(plan, needs)
+    try:
+        plan.matrix = _matrix(facts, plan.profile)
+    except CameraError as error:
+        plan.unusable["matrix"] = str(error)
+    part = plan.parts(next(iter(plan.choices.values())))[0] if plan.choices else None
+    part = part or plan.headers[0].parts[0]
+    windows = part.data_window, part.display_window
+    if across is not None and projection is None:
+        projection = "orthographic"
+    said = lens_in(facts, part.display_window, plan.profile.fov if plan.profile else ())
+    if fov is not None and projection in (None, "perspective"):
+        lens: Lens | None = Lens("perspective", fov)
+    elif projection == "latlong":
+        lens = Lens("latlong", 360.0)
+    elif across is not None:
+        lens = Lens("orthographic", across)
+    else:
+        lens = said if said and projection in (None, said.projection) else None
+    plan.projection = projection or (lens.projection if lens else None)
+    if lens is None:
+        if facts.get("envmap", LATLONG) != LATLONG:
+            plan.unusable["fov"] = "the header's envmap is a cube, which isn't read"
+        return
+    wide = {"fov": lens.width} if lens.projection == "perspective" else {}
+    if lens.projection == "orthographic":
+        wide = {"across": lens.width}
+    plan.camera = Camera.framed(facts, *windows, plan.matrix, projection=lens.projection, **wide)
+
+
 def _matrix(attributes: Mapping[str, Any], profile: Profile | None) -> NDArray[np.float64] | None:
     matrix = matrix_from_header(attributes)
     if matrix is None:
@@ -170,20 +291,6 @@ def _matrix(attributes: Mapping[str, Any], profile: Profile | None) -> NDArray[n
     if (np.linalg.det(matrix[:3, :3]) < 0) != world_is_left:
         matrix = np.diag([1.0, 1.0, -1.0, 1.0]) @ matrix
     return matrix
-
-
-def _camera(
-    part: exr.Part,
-    attributes: Mapping[str, Any],
-    profile: Profile | None,
-    fov: float | None,
-    matrix: NDArray[np.float64] | None,
-) -> Camera | None:
-    if fov is None and profile is not None and "deepshade:fov" not in attributes:
-        found = number(attributes, *profile.fov)
-        fov = None if math.isnan(found) else found
-    facts = {**attributes, "worldToCamera": None if matrix is None else matrix.T}
-    return Camera.from_header(facts, part.data_window, part.display_window, fov=fov)
 
 
 def chosen(
@@ -202,6 +309,7 @@ def chosen(
     }
     # the markers come last: the first choice, whose window counts, is one that is needed
     picked = dict(sorted(picked.items(), key=lambda item: item[0] not in used))
+    shaded = {id(part) for choice in picked.values() for part in plan.parts(choice)}
     windows: dict[exr.Window, str] = {}
     for name, choice in picked.items():
         for part in plan.parts(choice):
@@ -217,7 +325,10 @@ def chosen(
     window = next(iter(windows))
     for name in MARKERS:
         if name in plan.choices and plan.complete(plan.choices[name], window):
-            picked.setdefault(name, plan.choices[name])
+            (*_, part) = plan.parts(plan.choices[name])
+            alone = len(part.channels) == 1 or len(plan.headers[plan.choices[name].file].parts) == 1
+            if alone or id(part) in shaded:  # never of another part
+                picked.setdefault(name, plan.choices[name])
     return picked
 
 

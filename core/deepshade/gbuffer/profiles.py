@@ -1,14 +1,14 @@
 """How renderers name their channels, and in which space and handedness they write them.
 
-Each profile is one row of a table. Blender, Arnold, RenderMan, V-Ray and Unreal use fixed names;
-Mitsuba's are chosen by whoever wrote the scene, so its rows count only in files that say they
-come from Mitsuba, or when the profile is asked for. Depths along the view axis are the attribute
+Each profile is one row of a table. Blender, Arnold, RenderMan, V-Ray, Unreal and 3Delight use fixed
+names; others' are chosen by whoever wrote the scene (Mitsuba's), or mean something else to more
+usual renderers (Mantra's P), so their rows count only in files that say by whom they are, or when
+the profile is asked for. Depths along the view axis are the attribute
 `depth`, those along the ray the quantity `distance`.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.errors import ConfigError
+from deepshade.gbuffer.lenses import number
 
 # What a file may hold beyond the attributes themselves; attributes are derived from them.
 QUANTITIES: dict[str, int] = {
@@ -34,12 +35,16 @@ Header = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A quantity, the layer names it goes by, and what turns the stored values into ours."""
+    """A quantity, the layer names it goes by, and what turns the stored values into ours.
+
+    Motion may be `per_frame`: that of the whole interval between two frames, not of an exposure.
+    """
 
     quantity: str
     layers: tuple[str, ...]
     signs: tuple[int, ...] = ()
     components: str = ""
+    per_frame: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,18 +103,15 @@ def _signed(*prefixes: str) -> Callable[[Header], bool]:
     return lambda header: any(key.startswith(prefixes) for key in header)
 
 
+def _software(name: str) -> Callable[[Header], bool]:
+    keys = ("software", "generatedby", "renderer", "creator")
+    return lambda header: any(
+        name in str(value).lower() for key, value in header.items() if key.lower() in keys
+    )
+
+
 def _blender(header: Header) -> bool:
     return _signed("cycles.", "blender")(header) or str(header.get("File", "")).endswith(".blend")
-
-
-def number(header: Header, *keys: str) -> float:
-    """The first of these attributes that is a number; NaN if none is."""
-    for key in keys:
-        try:
-            return float(header[key])
-        except (KeyError, TypeError, ValueError):
-            continue
-    return math.nan
 
 
 def _unreal_matrix(header: Header) -> NDArray[np.float64] | None:
@@ -133,9 +135,13 @@ def _unreal_matrix(header: Header) -> NDArray[np.float64] | None:
 _UP_TO_DOWN = (1, -1)  # image v points down
 _INTO_SCREEN = (1, 1, -1)  # a left-handed camera's z
 
-_CANONICAL = tuple(
-    Source(name, ("Z", "depth") if name == "depth" else (name,)) for name in ATTRIBUTES
-)
+# what people call them besides
+_ALSO = {
+    "depth": ("Z", "depth", "Pz", "distance_to_image_plane"),  # Pz: Houdini's
+    "position": ("position", "P_camera", "P.camera", "position_camera"),  # 3Delight has dots
+    "normal": ("normal", "N_camera", "N.camera", "normal_camera"),
+}
+_CANONICAL = tuple(Source(name, _ALSO.get(name, (name,))) for name in ATTRIBUTES)
 
 _TABLE: Sequence[Profile] = (
     Profile(
@@ -143,6 +149,7 @@ _TABLE: Sequence[Profile] = (
         (
             *_CANONICAL,
             Source("position_world", ("position_world",)),
+            Source("distance", ("distance", "distance_to_camera")),
             Source("alpha", ("A",)),
             Source("beauty", ("beauty", "Combined", "Image", "rgba", "rgb", "Ci")),
         ),
@@ -158,7 +165,7 @@ _TABLE: Sequence[Profile] = (
             Source("depth", ("Depth", "Z")),
             Source("diffuse", ("DiffCol",)),
             # X Y lead to the previous frame, Z W to the next; v up
-            Source("motion", ("Vector",), _UP_TO_DOWN, components="zw"),
+            Source("motion", ("Vector",), _UP_TO_DOWN, components="zw", per_frame=True),
         ),
         _blender,
         up="z",
@@ -184,7 +191,6 @@ _TABLE: Sequence[Profile] = (
             Source("motion", ("motionvector",), _UP_TO_DOWN),
         ),
         _signed("arnold/"),
-        fov=("CameraFov",),
     ),
     Profile(
         "renderman",
@@ -213,7 +219,7 @@ _TABLE: Sequence[Profile] = (
             Source("normal", ("normals",)),
             Source("depth", ("zDepth", "Z")),
             Source("diffuse", ("diffuse_filter",)),
-            Source("motion", ("velocity",), _UP_TO_DOWN),
+            Source("motion", ("velocity",), _UP_TO_DOWN, per_frame=True),
         ),
         _signed("vray", "VRay"),
         up="z",
@@ -234,6 +240,76 @@ _TABLE: Sequence[Profile] = (
         world="left",
         fov=("unreal/camera/FinalImage/fov", "unreal/camera/fov"),
         matrix=_unreal_matrix,
+    ),
+    Profile(
+        "3delight",  # NSI names variables by their space: "P.camera", "N.world"
+        (
+            Source("position", ("P.camera", "P_camera")),
+            Source("normal", ("N.camera", "N_camera")),
+            Source("position_world", ("P.world", "P_world")),
+            Source("normal_world", ("N.world", "N_world")),
+            Source("depth", ("z",)),
+        ),
+        _software("3delight"),
+    ),
+    Profile(
+        "mantra",  # shades in camera space, and so exports P and N
+        (
+            Source("position", ("P",)),
+            Source("normal", ("N",)),
+            Source("depth", ("Pz",)),
+        ),
+        _software("mantra"),
+        free_names=True,
+    ),
+    Profile(
+        "karma",  # what its rays hit, in world space
+        (
+            Source("position_world", ("P", "hitP")),
+            Source("normal_world", ("N", "hitN")),
+            Source("depth", ("Pz", "hitPz")),
+            Source("diffuse", ("albedo",)),
+        ),
+        lambda header: (
+            {"renderTime_s", "renderMemory_s"} <= header.keys() or _software("karma")(header)
+        ),
+        free_names=True,
+    ),
+    Profile(
+        "luxcore",  # film outputs; DEPTH is how far the ray went
+        (
+            Source("position_world", ("POSITION",)),
+            Source("normal_world", ("SHADING_NORMAL", "AVG_SHADING_NORMAL")),
+            Source("distance", ("DEPTH",)),
+            Source("diffuse", ("ALBEDO",)),
+        ),
+        _software("luxcore"),
+        up="z",
+        free_names=True,
+    ),
+    Profile(
+        "blenderproc",  # normals of camera space, encoded
+        (
+            Source("normal", ("normals",)),
+            Source("depth", ("depth",)),
+            Source("distance", ("distance",)),
+        ),
+        _software("blenderproc"),
+        up="z",
+        free_names=True,
+    ),
+    Profile(
+        "replicator",  # Omniverse's annotators
+        (
+            Source("normal_world", ("normals", "PtWorldNormal", "NormalSD", "SmoothNormal")),
+            Source("position_world", ("PtWorldPos",)),
+            Source("depth", ("distance_to_image_plane", "DistanceToImagePlaneSD", "PtZDepth")),
+            Source("distance", ("distance_to_camera", "DistanceToCameraSD")),
+            Source("diffuse", ("DiffuseAlbedo",)),
+        ),
+        _software("omniverse"),
+        up="z",
+        free_names=True,
     ),
 )
 

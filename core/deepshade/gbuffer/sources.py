@@ -45,6 +45,8 @@ def passed_over(
         places = []
     if not (depths and places and plan.camera) or conventions.checks == "trust":
         return {}
+    if plan.camera.projection != "perspective":
+        return {}
     (place, depth) = places[0], depths[0]
     window = plan.parts(plan.choices[place])[0].data_window
     if not plan.complete(plan.choices[depth], window):
