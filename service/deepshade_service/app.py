@@ -27,6 +27,7 @@ from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
 from deepshade_service.environments import SHARE, Environments
+from deepshade_service.guard import Guard, cross_origin
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, find_effects, not_ready
@@ -123,6 +124,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app, ShadeParameters.model_fields)
+    cross_origin(app, service.settings.origins)
+    app.add_middleware(Guard, hosts=service.settings.hosts, origins=service.settings.origins)
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
 

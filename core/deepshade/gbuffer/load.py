@@ -17,7 +17,7 @@ from deepshade.camera import Camera, placement_of
 from deepshade.errors import ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
 from deepshade.exr.entries import Entry
-from deepshade.gbuffer import background, channels, derivation
+from deepshade.gbuffer import background, channels, derivation, directions
 from deepshade.gbuffer.checks import Verdict, examine
 from deepshade.gbuffer.conventions import Conventions, apply
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
@@ -261,6 +261,7 @@ def _together(
     if len(jobs) > 1 and not background.same(arrays, suspects, [job.choices for job in jobs]):
         return None
     empty, nonfinite = background.remove(arrays, suspects)
+    directions.shorten(arrays)
     plan = jobs[0].plan
     if jobs[0].conventions.checks != "trust":
         reach = jobs[0].radius or number(plan.attributes, "deepshade:radius")
