@@ -258,10 +258,10 @@ def _together(
     choices = {name: choice for job in jobs for name, choice in job.choices.items()}
     arrays, suspects = _read(bodies, headers, choices, limits, read)
     verdict = _checked(jobs, choices, arrays)
+    directions.mend(arrays)
     if len(jobs) > 1 and not background.same(arrays, suspects, [job.choices for job in jobs]):
         return None
     empty, nonfinite = background.remove(arrays, suspects)
-    directions.shorten(arrays)
     plan = jobs[0].plan
     if jobs[0].conventions.checks != "trust":
         reach = jobs[0].radius or number(plan.attributes, "deepshade:radius")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from deepshade import exr, metrics
 from deepshade.bundles import Bundle
@@ -33,7 +34,7 @@ from deepshade_trainer.evaluation import prepared
 MEMORY = 8 * 2**30
 # What may differ from float64 in any case: 16 bits have 2^-9 of a value, 8 bits 2^-8 of a range,
 # and a network is some dozen such steps.
-FLOORS = {"fp32": 2e-5, "bf16": 2**-7, "int8": 2**-5}
+FLOORS = {"fp32": 1e-5, "bf16": 2**-8, "int8": 2**-6}
 _SEAMS = 1e-5  # what tiles may change, in fp32
 
 
@@ -103,7 +104,13 @@ class Bench:
 
     def shade(self, engine: Engine, picture: Picture) -> Float:
         """(C', H, W), as the service answers. Raises what it does, a Problem or DeepshadeError."""
-        upload, asked = Upload("", "case.exr", picture.body()), ShadeParameters(**picture.asked)
+        try:
+            asked = ShadeParameters(**picture.asked)
+        except ValidationError as error:  # what a request is answered with a 422 for
+            first = error.errors()[0]
+            where = ".".join(map(str, first["loc"]))
+            raise Problem(422, "bad-parameter", f"{where}: {first['msg']}") from None
+        upload = Upload("", "case.exr", picture.body())
         asked.check([self.effect])
         limits = exr.Limits()
         headers = read_headers([upload], asked, limits)
