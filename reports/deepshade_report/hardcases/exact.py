@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -70,13 +71,8 @@ class Float64(_Torch):
 
     def answer(self, given: list[Tensor]) -> Tensor:
         """See `_Torch.answer`."""
-        usual = torch.get_default_dtype()
-        torch.set_default_dtype(torch.float64)  # of the constants that networks make
-        try:
-            with _Stay64():
-                answer: Tensor = self.shader(*(each.double() for each in given))
-        finally:
-            torch.set_default_dtype(usual)
+        with stay64():
+            answer: Tensor = self.shader(*(each.double() for each in given))
         if answer.dtype != torch.float64:
             raise TypeError(f"a step of {self.bundle.effect}'s network was in {answer.dtype}")
         return answer
@@ -93,6 +89,18 @@ class Rounded(_Torch):
         with torch.autocast("cpu", torch.bfloat16):
             answer: Tensor = self.shader(*given)
         return answer.float()
+
+
+@contextmanager
+def stay64() -> Iterator[None]:
+    """Networks stay in float64 inside, the constants that they make too."""
+    usual = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with _Stay64():
+            yield
+    finally:
+        torch.set_default_dtype(usual)
 
 
 class _Stay64(TorchFunctionMode):

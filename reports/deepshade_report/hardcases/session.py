@@ -12,18 +12,20 @@ from deepshade.engines import REFERENCE, Backend, usable
 from deepshade.errors import ConfigError
 from deepshade.files import shipped
 from deepshade_report.context import machine
-from deepshade_report.hardcases import table
+from deepshade_report.hardcases import learning, table
 from deepshade_report.hardcases.cases import CASES, LARGE, Case
 from deepshade_report.hardcases.exact import ROUNDED
 from deepshade_report.hardcases.measure import Bench, Row
 
 DEFAULT = "balanced"
-_SHAPE, _QUICK_SHAPE = (192, 256), (96, 128)
+# Not of pictures that are shaded: see `learning`.
+LEARNING = Case(learning.CASE, lambda effect, easy: iter(()))
+_SHAPE, _QUICK_SHAPE = (128, 192), (64, 96)
 
 
 def chosen_cases(texts: Collection[str] = (), *, large: bool = False) -> list[Case]:
     """Those whose names hold one of the texts; without, all. Raises ConfigError where none does."""
-    every = [*CASES, LARGE] if large else list(CASES)
+    every = [*CASES, *([LARGE] if large else []), LEARNING]
     found = [case for case in every if not texts or any(text in case.name for text in texts)]
     if not found:
         names = [case.name for case in every]
@@ -56,6 +58,9 @@ class Session:
         self.out.mkdir(parents=True, exist_ok=True)
         if not resume:
             self.file.unlink(missing_ok=True)
+        elif self.file.exists() and not self.file.read_bytes().endswith(b"\n"):
+            with self.file.open("a", encoding="utf-8") as file:
+                file.write("\n")  # it was killed while it wrote
         for number, bundle in enumerate(chosen):
             stamp = self._stamp(bundle)
             bench: Bench | None = None
@@ -116,6 +121,8 @@ class Session:
         return found
 
     def _rows(self, bench: Bench, case: Case) -> list[Row]:
+        if case is LEARNING:
+            return list(learning.rows(bench.bundle, bench.easy))
         rows = []
         for row, picture, answer in bench.rows(case):
             rows.append(row)
