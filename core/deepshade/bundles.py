@@ -177,18 +177,29 @@ def bundle_folders(*roots: Path | str) -> list[Path]:
     return [found[key] for key in sorted(found)]
 
 
-def write_config(path: Path | str, config: Mapping[str, Any], metrics: Mapping[str, Any]) -> Bundle:
+def write_config(
+    path: Path | str,
+    config: Mapping[str, Any],
+    metrics: Mapping[str, Any],
+    *,
+    graph: Path | None = None,
+) -> Bundle:
     """The bundle that a folder with its graph becomes: completed by configuration and metrics.
 
-    `config` holds the fields of `Bundle` but `path`, `hashes` and `metrics`. Written atomically,
-    `config.json` last: a folder without it is no bundle yet. Raises BundleError for a missing
-    graph or impossible values.
+    `config` holds the fields of `Bundle` but `path`, `hashes` and `metrics`. A new `graph`, a file
+    in the folder, takes the place of the one there. All is written before anything is replaced, so
+    that a full disk costs no bundle, and `config.json` is replaced last: what is cut off there is
+    refused by its hash. Raises BundleError for a missing graph or impossible values.
     """
     path = Path(path)
-    config = {**config, "hashes": {MODEL: _hash(path / MODEL)}}
+    config = {**config, "hashes": {MODEL: _hash(graph or path / MODEL)}}
     bundle = _from_config(path, config, dict(metrics))
-    _write_json(path / METRICS, metrics)
-    _write_json(path / CONFIG, config)
+    with replacing(path / CONFIG) as last, replacing(path / METRICS) as first:
+        _write_json(first, metrics)
+        _write_json(last, config)
+        if graph is not None:
+            with replacing(path / MODEL) as model:
+                graph.replace(model)
     return bundle
 
 
@@ -330,5 +341,4 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _write_json(path: Path, value: Mapping[str, Any]) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n", "utf-8")
+    path.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n", "utf-8")

@@ -21,12 +21,13 @@ from deepshade.effects import EFFECTS, SETTINGS, Setting
 from deepshade.engines import Engine
 from deepshade.errors import EngineError
 from deepshade.machine import trim
-from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade_service import composition, problems
 from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
+from deepshade_service.described import errors
 from deepshade_service.environments import SHARE, Environments
+from deepshade_service.guard import Guard, cross_origin
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, find_effects, not_ready
@@ -123,6 +124,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app, ShadeParameters.model_fields)
+    cross_origin(app, service.settings.origins)
+    app.add_middleware(Guard, hosts=service.settings.hosts, origins=service.settings.origins)
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
 
@@ -155,21 +158,38 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         headers["Server-Timing"] = server_timing(answer.stages)
         return Response(answer.content, media_type=answer.media_type, headers=headers)
 
-    @app.get("/effects", tags=["effects"], summary="All effects and their bundles")
+    @app.get(
+        "/effects",
+        tags=["effects"],
+        summary="All effects and their bundles",
+        responses=errors({503: "The bundles aren't verified yet"}),
+    )
     async def effects() -> list[dict[str, Any]]:
         return [_effect(name, service.models) for name in EFFECTS]
 
-    @app.get("/effects/{effect}", tags=["effects"], summary="One effect: inputs, bundles, metrics")
+    @app.get(
+        "/effects/{effect}",
+        tags=["effects"],
+        summary="One effect: inputs, bundles, metrics",
+        responses=errors({404: "Unknown effect", 503: "The bundles aren't verified yet"}),
+    )
     async def one_effect(effect: str) -> dict[str, Any]:
         return _effect(find_effect(effect).name, service.models)
 
     routes.install(app, service.environments, service.uploads, service.settings)
 
-    @app.get("/healthz", tags=["operation"], summary="Is the process alive?")
+    @app.get(
+        "/healthz", tags=["operation"], summary="Is the process alive?", responses=errors({})
+    )
     async def healthz() -> dict[str, str]:
         return {"status": "ok"}
 
-    @app.get("/readyz", tags=["operation"], summary="Are the bundles verified?")
+    @app.get(
+        "/readyz",
+        tags=["operation"],
+        summary="Are the bundles verified?",
+        responses=errors({503: "Not yet"}),
+    )
     async def readyz() -> dict[str, Any]:
         if not service.models.ready:
             raise not_ready(service.models)
@@ -177,7 +197,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         bundles = [f"{name}/{bundle.name}" for name in EFFECTS for bundle in models.bundles(name)]
         return {"status": "ready", "bundles": bundles, "refused": models.refused}
 
-    @app.get("/metrics", tags=["operation"], summary="Counters, for Prometheus")
+    @app.get(
+        "/metrics",
+        tags=["operation"],
+        summary="Counters, for Prometheus",
+        response_class=PlainTextResponse,
+        responses=errors({}),
+    )
     async def metrics() -> Response:
         return PlainTextResponse(service.telemetry.render(), media_type=METRICS_TYPE)
 
@@ -295,17 +321,6 @@ _SHADE_BODY = {
         },
     },
 }
-_PROBLEM = {
-    "type": "object",
-    "required": ["type", "title", "status", "detail"],
-    "properties": {
-        "type": {"type": "string"},
-        "title": {"type": "string"},
-        "status": {"type": "integer"},
-        "detail": {"type": "string"},
-        "fix": {"type": "string"},
-    },
-}
 _SHADE_RESPONSES: dict[int | str, Any] = {
     200: {
         "description": "The shaded picture",
@@ -316,17 +331,13 @@ _SHADE_RESPONSES: dict[int | str, Any] = {
         },
     }
 }
-_SHADE_RESPONSES |= {
-    status: {"description": text, "content": {PROBLEM_TYPE: {"schema": _PROBLEM}}}
-    for status, text in {
-        400: "No EXR, or a damaged one",
+_SHADE_RESPONSES |= errors(
+    {
         404: "Unknown effect, or no bundle for it",
-        408: "The body arrived too slowly",
-        413: "Over a limit",
         415: "Another content type than EXR or a form",
-        422: "A missing attribute or a bad parameter",
-        429: "The queue is full; see Retry-After",
+        422: "A missing attribute, a bad parameter, or a G-buffer that contradicts itself",
         500: "A bundle that can't be loaded, or a failure inside",
         503: "The bundles aren't verified yet",
-    }.items()
-}
+    },
+    uploads=True,
+)

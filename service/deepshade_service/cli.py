@@ -66,6 +66,20 @@ def serve(
     ] = None,
     body_timeout: Annotated[float, typer.Option(help="Seconds for a body to arrive.")] = 60.0,
     grace: Annotated[float, typer.Option(help="Seconds to finish work at the end.")] = 20.0,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A name that the service is asked for by, beside addresses and this machine's own;"
+            " '.example.com' is every name below it, '*' any; repeatable."
+        ),
+    ] = None,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Whose pages may use the service in a browser, as https://example.com, beside its"
+            " own; '*' any; repeatable."
+        ),
+    ] = None,
     log_level: Annotated[
         LogLevel, typer.Option(case_sensitive=False, help="The least that is logged.")
     ] = "info",
@@ -117,6 +131,8 @@ def serve(
         queue=queue,
         body_timeout=body_timeout,
         grace=grace,
+        hosts=allow_host or (),
+        origins=allow_origin or (),
     )
     with listen(host, port) as listener:
         _run(settings, listener, log_level)

@@ -48,7 +48,8 @@ class Settings:
     `engine` and `precision` pin what requests run on that pin nothing themselves; None leaves it
     to the rule (`deepshade.engines.choose`). `environments` is a folder of environment maps, into
     which requests may add more if `environment_uploads`; those prepared may take a quarter of
-    `memory` besides.
+    `memory` besides. `hosts` are names that the service goes by, `origins` those whose pages may
+    use it, beside its own (`guard.Guard`).
     """
 
     models: Path | Sequence[Path] = field(default_factory=bundle_roots)
@@ -66,6 +67,8 @@ class Settings:
     body_timeout: float = 60.0
     idle_trim: float = 1.0
     grace: float = 20.0
+    hosts: Sequence[str] = ()
+    origins: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         most = 2 * self.limits.body_bytes

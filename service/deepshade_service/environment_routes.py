@@ -7,20 +7,24 @@ from typing import Any
 from fastapi import FastAPI, Request, Response
 
 from deepshade_service.config import Settings
+from deepshade_service.described import errors
 from deepshade_service.environments import Environments
 from deepshade_service.problems import Problem
 from deepshade_service.uploads import RAW_TYPES, Uploads
 
-_BODY = {
-    "required": True,
-    "content": {kind: {"schema": {"type": "string", "format": "binary"}} for kind in RAW_TYPES},
-}
+_BINARY = {"type": "string", "format": "binary"}
+_BODY = {"required": True, "content": {kind: {"schema": _BINARY} for kind in RAW_TYPES}}
 
 
 def install(app: FastAPI, environments: Environments, uploads: Uploads, settings: Settings) -> None:
     """Add the routes to `app`."""
 
-    @app.get("/environments", tags=["environments"], summary="All environment maps")
+    @app.get(
+        "/environments",
+        tags=["environments"],
+        summary="All environment maps",
+        responses=errors({}),
+    )
     async def listed() -> list[dict[str, Any]]:
         """Names for `?environment=`; `sky` is generated. Hash and size once a map has been used."""
         return [environments.describe(name) for name in environments.names()]
@@ -30,7 +34,8 @@ def install(app: FastAPI, environments: Environments, uploads: Uploads, settings
         tags=["environments"],
         summary="A small picture of a map",
         response_class=Response,
-        responses={200: {"content": {"image/png": {}}}},
+        responses={200: {"content": {"image/png": {"schema": _BINARY}}}}
+        | errors({404: "There is no such map", 422: "Its file can't be used"}),
     )
     async def thumbnail(name: str) -> Response:
         return Response(await environments.thumbnail(name), media_type="image/png")
@@ -41,6 +46,7 @@ def install(app: FastAPI, environments: Environments, uploads: Uploads, settings
         summary="Add a map, or replace the one of that name",
         status_code=201,
         openapi_extra={"requestBody": _BODY},
+        responses=errors({422: "No such map can be used"}, uploads=True),
     )
     async def add(name: str, request: Request) -> dict[str, Any]:
         """The body is a latitude-longitude EXR or Radiance HDR. Only where the operator allows it

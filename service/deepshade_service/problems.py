@@ -8,10 +8,11 @@ from collections.abc import Collection, Mapping
 from http import HTTPStatus
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from deepshade.errors import DeepshadeError, EngineError, LimitError, nearest
 from deepshade.problems import MEDIA_TYPE, facts_of, kind_of, type_uri
@@ -28,6 +29,7 @@ _OPTIONS = {
     "files": "--max-files",
     "memory_bytes": "--memory",
 }
+CLIENT_GONE = 499
 _SWITCHES = ("strict", "trust")  # which commands take without a value
 
 
@@ -135,6 +137,11 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
         detail = "; ".join(f"{entry['where']}: {entry['problem']}" for entry in errors)
         fix = "; ".join(filter(None, (_fix(entry, parameters) for entry in error.errors())))
         return respond(Problem(422, "bad-parameter", detail, fix=fix, errors=errors))
+
+    @app.exception_handler(ClientDisconnect)
+    async def _(request: Request, error: ClientDisconnect) -> Response:
+        # Nobody reads it, but it is counted, as what nginx calls it, and not as a failure of ours.
+        return Response(status_code=CLIENT_GONE)
 
     @app.exception_handler(Exception)
     async def _(request: Request, error: Exception) -> JSONResponse:

@@ -44,6 +44,8 @@ from deepshade_workers.scenes.procedural import FAMILIES
 from deepshade_workers.shards import schema, write_shard
 from deepshade_workers.view import View
 
+from ..faults import full_disk
+
 SCENES = ("procedural:stairs", "procedural:level", "procedural:rubble")
 SPEC = DataSpec(scenes=SCENES, views=12, size=32, frame=64, spp=16, seed=5, shard_size=3)
 ROOT = Path(__file__).parents[2]
@@ -112,6 +114,15 @@ def test_a_shard_holds_what_the_manifest_says(tmp_path: Path) -> None:
     assert [record["scene"].split(":")[1] for record in shard.samples] == [
         SCENES[k % 3].split(":")[1] for k in SPEC.samples(1)
     ]
+
+
+def test_a_full_disk_leaves_no_half_shard(tmp_path: Path) -> None:
+    for room in (0, 1000, 20_000):
+        with full_disk(room), pytest.raises(OSError, match="large"):
+            make_shard(SPEC, 1, tmp_path, lambda: None)
+        assert list(tmp_path.iterdir()) == []
+    shard = make_shard(SPEC, 1, tmp_path, lambda: None)
+    assert sha256(tmp_path / shard.file) == shard.sha256
 
 
 def test_shards_hold_light_and_lengths(tmp_path: Path) -> None:

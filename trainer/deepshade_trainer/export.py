@@ -17,11 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deepshade.bundles import CONFIG, MODEL, Bundle, write_config
+from deepshade.bundles import MODEL, Bundle, write_config
 from deepshade.effects import EFFECTS
 from deepshade.environments import Prepared, sky
 from deepshade.errors import DataError
-from deepshade.files import replacing
+from deepshade.files import replacing, scratch
 from deepshade.tensors import up
 from deepshade_trainer.dataset import Dataset, spread
 from deepshade_trainer.graph import (
@@ -77,43 +77,43 @@ def export(
     effect = EFFECTS[recipe.effect]
     trained, held = gbuffers(recipe, data, shader.per_channel, shader.size_multiple)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / CONFIG).unlink(missing_ok=True)  # no bundle while its graph changes
-    graph = write_onnx(shader, folder / MODEL)
-    given = some_light(shader)
-    worst = parity(shader, folder / MODEL, held)
-    if not worst <= TOLERANCE:
-        raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
-    side = up(_SIDE, shader.size_multiple)
-    rounded = shader.network.rounded
-    float32, after = float32_marks(graph, rounded)
-    config = {
-        "effect": recipe.effect,
-        "name": folder.name,
-        "inputs": effect.inputs,
-        "outputs": effect.outputs,
-        "radius": radius,
-        "fov": fov,
-        "size_multiple": shader.size_multiple,
-        "halo": shader.halo,
-        "ranges": {
-            name: (
-                min(float(each[:, place].min()) for each in trained),
-                max(float(each[:, place].max()) for each in trained),
-            )
-            for name, place in shader.places.items()
-        },
-        "bytes_per_pixel": bytes_per_pixel(graph, INPUT, (shader.channels, side, side), given),
-        "per_channel": shader.per_channel,
-        "float32": float32,
-        "float32_after": after,
-        "int8": int8_ranges(graph, INPUT, [each.numpy() for each in trained], rounded, given),
-        "network": asdict(recipe.network),
-        **({"environment": list(given)} if given else {}),
-        "input_name": INPUT,
-        "output_name": OUTPUT,
-    }
-    metrics = {**(metrics or {}), "parity": {"onnxruntime_vs_torch_max": worst}}
-    return write_config(folder, config, metrics), worst
+    with scratch(folder / MODEL) as file:  # what is there stays until all is done
+        graph = write_onnx(shader, file)
+        given = some_light(shader)
+        worst = parity(shader, file, held)
+        if not worst <= TOLERANCE:
+            raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
+        side = up(_SIDE, shader.size_multiple)
+        rounded = shader.network.rounded
+        float32, after = float32_marks(graph, rounded)
+        config = {
+            "effect": recipe.effect,
+            "name": folder.name,
+            "inputs": effect.inputs,
+            "outputs": effect.outputs,
+            "radius": radius,
+            "fov": fov,
+            "size_multiple": shader.size_multiple,
+            "halo": shader.halo,
+            "ranges": {
+                name: (
+                    min(float(each[:, place].min()) for each in trained),
+                    max(float(each[:, place].max()) for each in trained),
+                )
+                for name, place in shader.places.items()
+            },
+            "bytes_per_pixel": bytes_per_pixel(graph, INPUT, (shader.channels, side, side), given),
+            "per_channel": shader.per_channel,
+            "float32": float32,
+            "float32_after": after,
+            "int8": int8_ranges(graph, INPUT, [each.numpy() for each in trained], rounded, given),
+            "network": asdict(recipe.network),
+            **({"environment": list(given)} if given else {}),
+            "input_name": INPUT,
+            "output_name": OUTPUT,
+        }
+        metrics = {**(metrics or {}), "parity": {"onnxruntime_vs_torch_max": worst}}
+        return write_config(folder, config, metrics, graph=file), worst
 
 
 def gbuffers(

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from deepshade.bundles import CONFIG, MODEL, Bundle, write_config
+from deepshade.bundles import MODEL, Bundle, write_config
 from deepshade.effects import EFFECTS
 from deepshade.environments import Prepared, sky, world_to_map
 from deepshade.errors import DataError
+from deepshade.files import scratch
 from deepshade.tensors import up
 from deepshade_trainer.export import INPUT, OPSET, OUTPUT, TOLERANCE, quiet
 from deepshade_trainer.graph import bytes_per_pixel, float32_marks, fold_constants, session
@@ -71,51 +72,51 @@ def _export(
     effect = EFFECTS[folder.parent.name]
     shader.eval().prepare_export()
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / CONFIG).unlink(missing_ok=True)  # no bundle while its graph changes
-    given = [torch.from_numpy(picture(up(_SIDE, shader.size_multiple), effect.inputs))]
-    lit = Prepared.of(sky(height=64)).inputs(GIVEN, 30.0, "y")
-    given += [torch.from_numpy(lit[name]) for name in GIVEN]
-    free = {2: "height", 3: "width"}
-    with TemporaryDirectory() as scratch, quiet(), torch.inference_mode():
-        raw = Path(scratch) / MODEL
-        torch.onnx.export(
-            shader,
-            tuple(given),
-            str(raw),
-            input_names=[INPUT, *GIVEN],
-            output_names=[OUTPUT],
-            dynamic_axes={INPUT: free, OUTPUT: free},
-            opset_version=OPSET,
-            dynamo=False,
-        )
-        graph = fold_constants(raw, folder / MODEL)
-    worst = _parity(shader, folder / MODEL, given)
-    if not worst <= TOLERANCE:
-        raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
-    marks = [float32_marks(graph, prefix) for prefix in shader.rounded] or [([OUTPUT], [])]
-    further = {name: tensor.numpy() for name, tensor in zip(GIVEN, given[1:], strict=True)}
-    side = up(_COUNTED, shader.size_multiple)
-    counted = given[0].shape[1], side, side
-    config = {
-        "effect": effect.name,
-        "name": folder.name,
-        "inputs": effect.inputs,
-        "outputs": effect.outputs,
-        "radius": 1.0,
-        "fov": 50.0,
-        "size_multiple": shader.size_multiple,
-        "halo": shader.halo,
-        "bytes_per_pixel": bytes_per_pixel(graph, INPUT, counted, further),
-        "float32": list(dict.fromkeys(name for before, _ in marks for name in before)),
-        "float32_after": [name for _, after in marks for name in after],
-        "int8": int8 or {},
-        "network": network,
-        "environment": list(GIVEN),
-        "input_name": INPUT,
-        "output_name": OUTPUT,
-    }
-    metrics = {"parity": {"onnxruntime_vs_torch_max": worst}}
-    return write_config(folder, config, metrics), worst
+    with scratch(folder / MODEL) as file:  # what is there stays until all is done
+        given = [torch.from_numpy(picture(up(_SIDE, shader.size_multiple), effect.inputs))]
+        lit = Prepared.of(sky(height=64)).inputs(GIVEN, 30.0, "y")
+        given += [torch.from_numpy(lit[name]) for name in GIVEN]
+        free = {2: "height", 3: "width"}
+        with TemporaryDirectory() as passing, quiet(), torch.inference_mode():
+            raw = Path(passing) / MODEL
+            torch.onnx.export(
+                shader,
+                tuple(given),
+                str(raw),
+                input_names=[INPUT, *GIVEN],
+                output_names=[OUTPUT],
+                dynamic_axes={INPUT: free, OUTPUT: free},
+                opset_version=OPSET,
+                dynamo=False,
+            )
+            graph = fold_constants(raw, file)
+        worst = _parity(shader, file, given)
+        if not worst <= TOLERANCE:
+            raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
+        marks = [float32_marks(graph, prefix) for prefix in shader.rounded] or [([OUTPUT], [])]
+        further = {name: tensor.numpy() for name, tensor in zip(GIVEN, given[1:], strict=True)}
+        side = up(_COUNTED, shader.size_multiple)
+        counted = given[0].shape[1], side, side
+        config = {
+            "effect": effect.name,
+            "name": folder.name,
+            "inputs": effect.inputs,
+            "outputs": effect.outputs,
+            "radius": 1.0,
+            "fov": 50.0,
+            "size_multiple": shader.size_multiple,
+            "halo": shader.halo,
+            "bytes_per_pixel": bytes_per_pixel(graph, INPUT, counted, further),
+            "float32": list(dict.fromkeys(name for before, _ in marks for name in before)),
+            "float32_after": [name for _, after in marks for name in after],
+            "int8": int8 or {},
+            "network": network,
+            "environment": list(GIVEN),
+            "input_name": INPUT,
+            "output_name": OUTPUT,
+        }
+        metrics = {"parity": {"onnxruntime_vs_torch_max": worst}}
+        return write_config(folder, config, metrics, graph=file), worst
 
 
 def picture(

@@ -15,7 +15,7 @@ from deepshade.camera import Projection
 from deepshade.errors import CameraError, ConfigError, ImageError, MissingAttributeError
 from deepshade.exr import Header, Limits
 from deepshade.exr.entries import Entry
-from deepshade.gbuffer import background, channels, derivation
+from deepshade.gbuffer import background, channels, derivation, directions
 from deepshade.gbuffer.checks import Verdict, examine
 from deepshade.gbuffer.conventions import Conventions, apply
 from deepshade.gbuffer.gbuffer import GBuffer
@@ -242,6 +242,7 @@ def _together(
             verdict.note(name, note)
         if warning:
             verdict.warn(warning, jobs[0].conventions)
+    directions.mend(arrays)
     if len(jobs) > 1 and not background.same(arrays, suspects, [job.choices for job in jobs]):
         return None
     empty, nonfinite = background.remove(arrays, suspects)

@@ -1,0 +1,1 @@
+"""Hard cases, as one table: case x effect x engine x precision (`deepshade hardcases`)."""
