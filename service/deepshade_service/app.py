@@ -27,6 +27,9 @@ from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
 from deepshade_service.environments import SHARE, Environments
+from deepshade_service.live import routes as live_routes
+from deepshade_service.live.session import Sessions
+from deepshade_service.live.tokens import Guard
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, find_effects, not_ready
@@ -63,6 +66,8 @@ class Service:
             self.environments,
             self.stopping,
         )
+        self.sessions = Sessions(settings)
+        self.guard = Guard(settings.token, beyond=settings.beyond)
         self.telemetry = Telemetry(
             queued=lambda: self.workers.taken, held=lambda: self.uploads.held
         )
@@ -76,6 +81,7 @@ class Service:
         finally:
             for task in tasks:
                 task.cancel()
+            self.sessions.stop()
             await self.workers.stop()
             await asyncio.gather(*tasks, return_exceptions=True)
 
@@ -164,6 +170,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         return _effect(find_effect(effect).name, service.models)
 
     routes.install(app, service.environments, service.uploads, service.settings)
+    live_routes.install(app, service, service.sessions, service.guard)
 
     @app.get("/healthz", tags=["operation"], summary="Is the process alive?")
     async def healthz() -> dict[str, str]:

@@ -25,7 +25,8 @@ from deepshade.gbuffer.profiles import QUANTITIES, number
 from deepshade.gbuffer.repair import repair
 from deepshade.gbuffer.sources import passed_over
 
-Source = Path | str | bytes | tuple[str, bytes]
+Body = bytes | exr.Planes
+Source = Path | str | bytes | tuple[str, Body]
 # quantities that were read to choose between them, and whether they hold NaN or infinities
 _Read = dict[channels.Choice, tuple[NDArray[np.float32], bool]]
 
@@ -113,8 +114,8 @@ def load_gbuffers(
 ) -> Generator[GBuffer]:
     """Loads one EXR file, or several of one view, for each of `needs`: names of attributes.
 
-    A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
-    (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
+    A source is a path, the bytes of a file, or (file name, bytes or planes). `profile` names the
+    renderer (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
     comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees.
     What isn't there, or is to be `anew`, is derived (`derivation`): `GBuffer.derived` says how.
     `conventions` say how values are stored, and which checks they have to pass (`checks`).
@@ -191,7 +192,7 @@ def _job(
 
 def _load(
     jobs: Sequence[_Job],
-    bodies: Sequence[bytes],
+    bodies: Sequence[Body],
     headers: Sequence[Header],
     limits: Limits,
     read: _Read,
@@ -245,7 +246,7 @@ def _matrix(plan: Plan) -> NDArray[np.float64]:
 
 def _together(
     jobs: Sequence[_Job],
-    bodies: Sequence[bytes],
+    bodies: Sequence[Body],
     headers: Sequence[Header],
     limits: Limits,
     read: _Read,
@@ -304,12 +305,14 @@ def source_name(field: str, filename: str) -> str:
     return f"{field}.exr" if field in QUANTITIES else filename
 
 
-def _fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str], list[bytes]]:
+def _fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str], list[Body]]:
     if isinstance(sources, str | bytes | Path) or (
         isinstance(sources, tuple) and [type(item) for item in sources] == [str, bytes]
     ):
         sources = [cast(Source, sources)]
-    stems, bodies, total = [], [], 0
+    stems: list[str] = []
+    bodies: list[Body] = []
+    total = 0
     for source in sources:
         name = source[0] if isinstance(source, tuple) else source
         stems.append("" if isinstance(name, bytes) else Path(name).stem)
@@ -349,7 +352,7 @@ def _derive(
 
 
 def _read(
-    bodies: Sequence[bytes],
+    bodies: Sequence[Body],
     headers: Sequence[Header],
     choices: Mapping[str, channels.Choice],
     limits: Limits,
