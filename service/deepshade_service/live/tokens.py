@@ -59,7 +59,7 @@ class Guard:
                 401,
                 "not-allowed",
                 "the token is wrong or has expired" if given else "a token is needed",
-                fix="send `Authorization: Bearer <the service's DEEPSHADE_TOKEN>`, or get a new link",
+                fix="send `Authorization: Bearer <DEEPSHADE_TOKEN>`, or get a new link",
                 headers={"WWW-Authenticate": "Bearer"},
             )
 

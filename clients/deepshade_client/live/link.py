@@ -1,0 +1,64 @@
+"""How fast the link is, and which codec is soonest through it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection
+
+from deepshade import live
+
+_MB = 1e6
+
+# codec -> (bytes before : after, MB/s in, MB/s out) of one core: `benchmarks/codecs.py`, G-buffers
+# of 16-bit normals and 32-bit depth
+_MEASURED = {
+    "raw": (1.0, 5000.0, 5000.0),
+    "lz4": (3.0, 600.0, 1500.0),
+    "zstd": (3.9, 400.0, 1000.0),
+    "deflate": (3.7, 450.0, 250.0),
+    "htj2k": (4.5, 130.0, 250.0),
+}
+_KEPT = 8  # measurements whose median counts
+_CHANGE = 0.85  # of what the present codec takes, before another one is chosen
+
+
+class Link:
+    """Learns from each frame: bytes per second, and how much each codec makes of what is sent."""
+
+    def __init__(self, codecs: Collection[str], fixed: str | None = None) -> None:
+        self._codecs = [name for name in live.available() if name in codecs]
+        self._ratio = {name: _MEASURED[name][0] for name in self._codecs}
+        self._rates: deque[float] = deque(maxlen=_KEPT)
+        self._fixed = fixed
+        self.codec = fixed or ("lz4" if "lz4" in self._codecs else "deflate")
+
+    @property
+    def bytes_s(self) -> float | None:
+        """The median of the last measurements; None before the first."""
+        return sorted(self._rates)[len(self._rates) // 2] if self._rates else None
+
+    def packed(self, codec: str, before: int, after: int) -> None:
+        """A frame's bytes, before and after its codec."""
+        old = self._ratio.get(codec, 1.0)
+        self._ratio[codec] = 0.8 * old + 0.2 * before / max(after, 1)
+
+    def sent(self, size: int, seconds: float) -> None:
+        """So many bytes took so long to arrive, without what an empty message takes."""
+        self._rates.append(size / max(seconds, 1e-5))
+
+    def choose(self, size: int) -> str:
+        """The codec for a frame of so many bytes: the least time for packing, link and unpacking.
+
+        The one in use stays unless another is clearly better, lest it change to and fro.
+        """
+        rate = self.bytes_s
+        if self._fixed is None and rate is not None:
+            times = {name: self._seconds(name, size, rate) for name in self._codecs}
+            best = min(times, key=lambda name: times[name])
+            if times[best] < _CHANGE * times.get(self.codec, float("inf")):
+                self.codec = best
+        return self.codec
+
+    def _seconds(self, codec: str, size: int, rate: float) -> float:
+        _, pack, unpack = _MEASURED[codec]
+        return size / (pack * _MB) + size / (unpack * _MB) + size / self._ratio[codec] / rate
