@@ -19,8 +19,8 @@ from deepshade.live import codecs
 LIMITS = exr.Limits(pixels=10_000, channels=8)
 
 
-def packed(planes: dict[str, np.ndarray], codec: str = "raw", **about: object) -> bytes:
-    return live.pack(live.GBUFFER, 7, planes, about, codec=codec, time=1.5, sent=2.5, flags=live.CUT)
+def packed(given: dict[str, np.ndarray], codec: str = "raw", **about: object) -> bytes:
+    return live.pack(live.GBUFFER, 7, given, about, codec=codec, time=1.5, sent=2.5, flags=live.CUT)
 
 
 def noise(shape: tuple[int, int], kind: str) -> np.ndarray:
@@ -139,8 +139,9 @@ def test_headers_hold_numbers_texts_vectors_and_matrices(value):
 def test_planes_are_read_as_an_exr_of_them_would_be():
     """The same G-buffer, whether its bytes were a file or never one."""
     rng = np.random.default_rng(0)
-    pixels = {f"normal.{axis}": rng.normal(size=(24, 32)).astype("<f2") for axis in "XYZ"}
-    pixels["Z"] = rng.uniform(1, 5, (24, 32)).astype("<f4")
+    pixels = {f"normal.{axis}": rng.normal(0, 0.02, (24, 32)).astype("<f2") for axis in "XYZ"}
+    pixels["normal.Z"] += np.float16(1)
+    pixels["Z"] = np.full((24, 32), 3, "<f4")
     pixels["Z"][:4] = np.inf
     pixels["Z"][9, 9] = np.nan
     matrix = np.eye(4, dtype=np.float32)

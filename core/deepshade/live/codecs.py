@@ -65,7 +65,7 @@ def decode(data: Bytes, codec: str, kind: np.dtype[Any], shape: tuple[int, int])
     size = kind.itemsize * shape[0] * shape[1]
     try:
         if codec == "raw":
-            return np.frombuffer(data, kind, shape[0] * shape[1]).reshape(shape)
+            return np.frombuffer(data, kind).reshape(shape)
         if codec == "deflate":
             return _joined(_inflated(data, size), kind, shape)
         if codec == "htj2k":
