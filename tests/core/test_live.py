@@ -32,7 +32,11 @@ def noise(shape: tuple[int, int], kind: str) -> np.ndarray:
 @pytest.mark.parametrize("codec", live.available())
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (64, 80)])
 def test_every_bit_comes_back(codec, shape):
-    planes = {"Z": noise(shape, "<f4"), "normal.X": noise(shape, "<f2"), "zero": np.zeros(shape, "f2")}
+    planes = {
+        "Z": noise(shape, "<f4"),
+        "normal.X": noise(shape, "<f2"),
+        "zero": np.zeros(shape, "f2"),
+    }
     frame = live.parse(packed(planes, codec, header={"deepshade:fov": 50.0}), LIMITS)
     assert (frame.id, frame.time, frame.sent, frame.flags) == (7, 1.5, 2.5, live.CUT)
     found = frame.planes()

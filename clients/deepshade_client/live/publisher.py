@@ -98,6 +98,7 @@ class Publisher:
         self._taken = asyncio.Event()
         self._under_way: dict[int, tuple[Picture, int, int, float]] = {}
         self._again: list[Picture] = []
+        self._sending: Picture | None = None  # taken, and not yet on its way
         self._last: tuple[Picture, bool] | None = None  # sent last, and whether it was whole
         self._finished = False
         self._credit = asyncio.Event()
@@ -247,6 +248,7 @@ class Publisher:
                 continue
             picture, whole = taken
             while True:
+                self._sending = picture
                 packed = await asyncio.to_thread(self._packed, picture, whole)
                 id, message, step, pixels, made = packed
                 await self._credit.wait()
@@ -255,7 +257,7 @@ class Publisher:
                 picture, whole = self._take(), False  # a newer one came while this one waited
             self._credit.clear()
             self._under_way[id] = picture, len(message), pixels, made
-            self._last = picture, step == 1
+            self._last, self._sending = (picture, step == 1), None
             began = time.monotonic()
             await socket.send(message)
             if id <= _MEASURE_FIRST or id % _MEASURE_EVERY == 0:
@@ -401,9 +403,14 @@ class Publisher:
         await self._out.put(answer)
 
     def _recall(self) -> None:
-        """What was under way is lost: it is sent again if every picture counts."""
-        if self._every:
-            self._again = [self._under_way[id][0] for id in sorted(self._under_way)] + self._again
+        """What was under way is lost: it is sent again if every picture counts, else the newest."""
+        lost = [self._under_way[id][0] for id in sorted(self._under_way)]
+        if not lost and self._last is not None and not self._every:
+            lost = [self._last[0]]  # nobody has an answer to it any more
+        if self._sending is not None:
+            lost.append(self._sending)
+        self._again = [*lost, *self._again] if self._every else lost[-1:]
+        self._sending = None
         self._under_way.clear()
 
 

@@ -68,6 +68,14 @@ class _Work:
         return bool(self.frame.flags & live.REST)
 
 
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """Why there is no answer to a frame; None where a newer one came."""
+
+    id: int
+    problem: Problem | None
+
+
 class Pipeline:
     """Shades what `offer` is given, and hands answers to the publisher's outlet and the session."""
 
@@ -85,7 +93,7 @@ class Pipeline:
         self._reader, self._say, self._outlet, self._want = reader, say, outlet, want
         self._pending: tuple[live.Frame, float] | None = None
         self._arrived = asyncio.Event()
-        self._decoded: asyncio.Queue[_Work] = asyncio.Queue(1)
+        self._decoded: asyncio.Queue[_Work | _Told] = asyncio.Queue(1)
         self._granted = False
         self._inferring = False
         self._settled: tuple[Asking, float] | None = None
@@ -107,8 +115,8 @@ class Pipeline:
                 if self._want is not None:
                     group.create_task(self._outlet.run())
         finally:
-            while not self._decoded.empty():
-                await self._decoded.get_nowait().room.aclose()
+            if not self._decoded.empty() and isinstance(work := self._decoded.get_nowait(), _Work):
+                await work.room.aclose()
 
     async def _grant(self) -> None:
         if not self._granted:
@@ -123,11 +131,7 @@ class Pipeline:
             (frame, made_at), self._pending = self._pending, None
             if not self._inferring and self._decoded.empty():
                 await self._grant()  # the link is what takes time: the next may set out
-            work = await self._or_refused(frame, self._decode(frame, made_at))
-            if work is None:
-                await self._grant()
-            else:
-                await self._decoded.put(work)
+            await self._decoded.put(await self._or_told(frame, self._decode(frame, made_at)))
 
     async def _infer_all(self) -> None:
         while True:
@@ -135,9 +139,18 @@ class Pipeline:
             work = await self._decoded.get()
             self._inferring = True
             await self._grant()
-            async with work.room:
-                answer = await self._or_refused(work.frame, self._unless_newer(work))
-            if answer is None:
+            answer: Answer | _Told = work if isinstance(work, _Told) else await self._answer(work)
+            if isinstance(answer, _Told):
+                if answer.problem is not None:
+                    if self._want is not None:
+                        await self._outlet.idle()  # answers to frames before it come first
+                    await self._say(
+                        {
+                            "type": "problem",
+                            "id": answer.id,
+                            "problem": problems.document(answer.problem),
+                        }
+                    )
                 continue
             for made in answer.made:
                 nonfinite = int(made.facts["nonfinite_pixels"])
@@ -147,12 +160,16 @@ class Pipeline:
                 await self._outlet.offer(answer, self._want)
             await self._session.show(answer)
 
-    async def _or_refused(self, frame: live.Frame, work: Awaitable[T]) -> T | None:
-        """What the work gives; None where it can't be done, which the publisher is told."""
+    async def _answer(self, work: _Work) -> Answer | _Told:
+        async with work.room:
+            return await self._or_told(work.frame, self._unless_newer(work))
+
+    async def _or_told(self, frame: live.Frame, work: Awaitable[T]) -> T | _Told:
+        """What the work gives, or what the publisher is told of it, in the order of its frames."""
         try:
             return await work
         except Cancelled:
-            return None
+            return _Told(frame.id, None)
         except Problem as error:
             problem = error
         except DeepshadeError as error:
@@ -160,9 +177,7 @@ class Pipeline:
         except Exception:
             log.exception("frame %d of session %s", frame.id, self._session.name)
             problem = Problem(500, "internal", "the service failed on this frame; its log says how")
-        told = {"type": "problem", "id": frame.id, "problem": problems.document(problem)}
-        await self._say(told)
-        return None
+        return _Told(frame.id, problem)
 
     async def _decode(self, frame: live.Frame, made_at: float) -> _Work:
         watch, shader = Stopwatch(), self._shader

@@ -192,6 +192,8 @@ class Sessions:
             there.replaced.set()
             there.replaced = asyncio.Event()
             return there
+        if len(self._sessions) >= self._settings.live_sessions and self._leaving:
+            self._end(self._sessions[next(iter(self._leaving))])  # gone for longest
         if len(self._sessions) >= self._settings.live_sessions:
             raise Problem(
                 429,

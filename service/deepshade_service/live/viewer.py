@@ -31,6 +31,7 @@ class Outlet:
         self._next: tuple[Answer, Want] | None = None
         self._changed = asyncio.Event()
         self._under_way: dict[int, float] = {}
+        self._busy = False
         self.sent_bytes = 0
         self.overwritten = 0
 
@@ -41,6 +42,11 @@ class Outlet:
         self.overwritten += self._next is not None
         self._next = answer, want
         self._changed.set()
+
+    async def idle(self) -> None:
+        """Returns when nothing waits and nothing is being sent."""
+        while self._next is not None or self._busy:
+            await self._turn()
 
     def acknowledge(self, id: object) -> None:
         """That answer has arrived, and so have those before it."""
@@ -55,12 +61,15 @@ class Outlet:
             while self._next is None or self._full():
                 await self._turn(_PATIENCE if self._next else None)
             (answer, want), self._next = self._next, None
+            self._busy = True
             self._changed.set()
             message = await answer.message(want)
             if self._window is not None:
                 self._under_way[answer.id] = asyncio.get_running_loop().time()
             await self._send(message)
             self.sent_bytes += len(message)
+            self._busy = False
+            self._changed.set()
 
     def _full(self) -> bool:
         if self._window is None:
