@@ -16,14 +16,21 @@ from dataclasses import dataclass, field, replace
 from math import prod
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from deepshade import exr, live
+from deepshade.effects import SETTINGS
 from deepshade.errors import DeepshadeError
-from deepshade.gbuffer import GBuffer
+from deepshade.gbuffer import GBuffer, load_gbuffers
+from deepshade.gbuffer.conventions import Conventions
+from deepshade.gbuffer.plan import plan_gbuffer
 from deepshade_service import problems
 from deepshade_service.answers import Made
-from deepshade_service.decoding import decode, read_headers
+from deepshade_service.decoding import decode, read_headers, stored
 from deepshade_service.live.answer import Answer, Want
 from deepshade_service.live.asking import Asking, Reader
+from deepshade_service.live.history import History
 from deepshade_service.live.session import Session
 from deepshade_service.live.viewer import Outlet
 from deepshade_service.parameters import ShadeParameters
@@ -35,6 +42,7 @@ from deepshade_service.workers import Cancelled
 log = logging.getLogger("deepshade.service")
 
 T = TypeVar("T")
+Float = NDArray[np.float32]
 Say = Callable[[dict[str, Any]], Awaitable[None]]
 
 _SHARP_TILE = 2**20  # pixels; a sharp picture is given up between tiles when a new frame comes
@@ -61,6 +69,7 @@ class _Work:
     gbuffers: list[GBuffer]
     held: int
     room: AsyncExitStack
+    motion: Float | None = None
     took_ms: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -88,9 +97,11 @@ class Pipeline:
         say: Say,
         outlet: Outlet,
         want: Want | None,
+        history: History | None,
     ) -> None:
         self._shader, self._telemetry, self._session = shader, telemetry, session
         self._reader, self._say, self._outlet, self._want = reader, say, outlet, want
+        self._history = history
         self._pending: tuple[live.Frame, float] | None = None
         self._arrived = asyncio.Event()
         self._decoded: asyncio.Queue[_Work | _Told] = asyncio.Queue(1)
@@ -189,10 +200,12 @@ class Pipeline:
                 picture = _Picture(frame.picture())
                 return picture, read_headers([picture], asked, shader.limits)
 
-        def load(_: threading.Event) -> list[GBuffer]:
+        def load(_: threading.Event) -> tuple[list[GBuffer], Float | None]:
             with watch.time("decode"):
                 bundles = [job.bundle for job in jobs]
-                return list(decode([picture], headers, bundles, asked, shader.limits))
+                gbuffers = list(decode([picture], headers, bundles, asked, shader.limits))
+                motion = None if self._history is None else _motion(picture, headers, asked)
+                return gbuffers, motion
 
         picture, headers = await shader.workers.run(unpack)
         jobs = await shader.jobs(headers, asked, asking.candidates)
@@ -200,12 +213,13 @@ class Pipeline:
         room = AsyncExitStack()
         await room.enter_async_context(shader.memory.hold(held))
         try:
-            gbuffers = await shader.workers.run(load)
+            gbuffers, motion = await shader.workers.run(load)
         except BaseException:
             await room.aclose()
             raise
         took = watch.milliseconds
-        return _Work(frame, made_at, asking, asked, headers, jobs, gbuffers, held, room, took)
+        read = headers, jobs, gbuffers
+        return _Work(frame, made_at, asking, asked, *read, held, room, motion, took)
 
     def _steady(self, asking: Asking, frame: live.Frame) -> ShadeParameters:
         """The settings, with the radius of the stream's first frame where none is asked for.
@@ -248,6 +262,11 @@ class Pipeline:
                     most = min(job.need.max_pixels, _SHARP_TILE)
                     job = replace(job, need=replace(job.need, max_pixels=most))
                 shade, how = run(job, gbuffer, work.headers, work.parameters, work.held, cancelled)
+                if self._history is not None:
+                    alone = work.rest or bool(frame.flags & live.CUT)
+                    shade = self._history.blend(
+                        job.bundle.effect, shade, gbuffer, work.motion, alone=alone
+                    )
                 shades[job.bundle.effect] = shade
                 made.append(how)
             took = dict(work.took_ms)
@@ -267,6 +286,25 @@ class Pipeline:
         found = [how.plan["radius"] for how in made if how.plan.get("radius_source") == "depth"]
         if found:
             self._settled = work.asking, found[0]
+
+
+def _motion(
+    picture: _Picture, headers: Sequence[exr.Header], asked: ShadeParameters
+) -> Float | None:
+    """(2, H, W): by how many pixels surfaces moved since the frame before; None if it isn't there.
+
+    A picture's motion is that of its open shutter, which is so many frames.
+    """
+    how = {"profile": asked.profile, "mapping": asked.mapping}
+    plan = plan_gbuffer(headers, [""], ["motion"], **how)
+    if "motion" not in plan.choices:
+        return None
+    trusted = Conventions(checks="trust")
+    (gbuffer,) = load_gbuffers(
+        [("", picture.data)], [["motion"]], headers=headers, conventions=trusted, **how
+    )
+    shutter = stored(gbuffer, SETTINGS["shutter"]) or 1.0
+    return gbuffer.attributes["motion"] / np.float32(shutter)
 
 
 def _full(frame: live.Frame) -> tuple[int, int]:

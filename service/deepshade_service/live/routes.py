@@ -17,6 +17,7 @@ from deepshade_service import problems
 from deepshade_service.live.answer import Want
 from deepshade_service.live.asking import Asking, Reader
 from deepshade_service.live.connection import Connection
+from deepshade_service.live.history import History
 from deepshade_service.live.pipeline import Pipeline, source_time
 from deepshade_service.live.session import Session, Sessions
 from deepshade_service.live.tokens import Guard
@@ -118,9 +119,9 @@ async def _publish(connection: Connection, name: str, service: Service, sessions
         )
         every = hello.get("every") is True
         outlet = Outlet(connection.send, every=every, window=None)
-        pipeline = Pipeline(
-            service.shader, service.telemetry, session, reader, connection.say, outlet, want
-        )
+        history = History() if hello.get("history") is True else None
+        sides = connection.say, outlet, want, history
+        pipeline = Pipeline(service.shader, service.telemetry, session, reader, *sides)
         listening = _listen(connection, messages, session, pipeline, service)
         ended = await _until_first_ends(
             listening,
