@@ -27,9 +27,10 @@ from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
 from deepshade_service.environments import SHARE, Environments
+from deepshade_service.guard import Guard, cross_origin
 from deepshade_service.live import routes as live_routes
 from deepshade_service.live.session import Sessions
-from deepshade_service.live.tokens import Guard
+from deepshade_service.live.tokens import Tokens
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, find_effects, not_ready
@@ -67,7 +68,7 @@ class Service:
             self.stopping,
         )
         self.sessions = Sessions(settings)
-        self.guard = Guard(settings.token, beyond=settings.beyond)
+        self.tokens = Tokens(settings.token, beyond=settings.beyond)
         self.telemetry = Telemetry(
             queued=lambda: self.workers.taken, held=lambda: self.uploads.held
         )
@@ -129,6 +130,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.service = service
     problems.install(app, ShadeParameters.model_fields)
+    cross_origin(app, service.settings.origins)
+    app.add_middleware(Guard, hosts=service.settings.hosts, origins=service.settings.origins)
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
 
@@ -170,7 +173,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         return _effect(find_effect(effect).name, service.models)
 
     routes.install(app, service.environments, service.uploads, service.settings)
-    live_routes.install(app, service, service.sessions, service.guard)
+    live_routes.install(app, service, service.sessions, service.tokens)
 
     @app.get("/healthz", tags=["operation"], summary="Is the process alive?")
     async def healthz() -> dict[str, str]:

@@ -67,6 +67,20 @@ def serve(
     ] = None,
     body_timeout: Annotated[float, typer.Option(help="Seconds for a body to arrive.")] = 60.0,
     grace: Annotated[float, typer.Option(help="Seconds to finish work at the end.")] = 20.0,
+    allow_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A name that the service is asked for by, beside addresses and this machine's own;"
+            " '.example.com' is every name below it, '*' any; repeatable."
+        ),
+    ] = None,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Whose pages may use the service in a browser, as https://example.com, beside its"
+            " own; '*' any; repeatable."
+        ),
+    ] = None,
     token: Annotated[
         str | None,
         typer.Option(
@@ -130,6 +144,8 @@ def serve(
         queue=queue,
         body_timeout=body_timeout,
         grace=grace,
+        hosts=allow_host or (),
+        origins=allow_origin or (),
         live_sessions=live_sessions,
         live_viewers=live_viewers,
         live_frame=parse_size(live_frame),

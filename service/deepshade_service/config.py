@@ -49,7 +49,8 @@ class Settings:
     `engine` and `precision` pin what requests run on that pin nothing themselves; None leaves it
     to the rule (`deepshade.engines.choose`). `environments` is a folder of environment maps, into
     which requests may add more if `environment_uploads`; those prepared may take a quarter of
-    `memory` besides.
+    `memory` besides. `hosts` are names that the service goes by, `origins` those whose pages may
+    use it, beside its own (`guard.Guard`).
 
     Of live sessions: how many, how many `live_viewers` each, the bytes of a frame, and how many a
     second a publisher may send. `token` is what publishers show, and viewers, if they have no
@@ -72,6 +73,8 @@ class Settings:
     body_timeout: float = 60.0
     idle_trim: float = 1.0
     grace: float = 20.0
+    hosts: Sequence[str] = ()
+    origins: Sequence[str] = ()
     live_sessions: int = 8
     live_viewers: int = 32
     live_frame: int = 64 * MIB

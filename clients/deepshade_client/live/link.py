@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
+from typing import Any
+
+from numpy.typing import NDArray
 
 from deepshade import live
+from deepshade.live import codecs
 
 _MB = 1e6
 
@@ -18,6 +22,7 @@ _MEASURED = {
     "deflate": (3.0, 290.0, 150.0),
     "htj2k": (2.8, 110.0, 260.0),
 }
+_STRIP = 48  # rows that are tried
 _KEPT = 8  # measurements whose median counts
 _CHANGE = 0.85  # of what the present codec takes, before another one is chosen
 
@@ -25,12 +30,20 @@ _CHANGE = 0.85  # of what the present codec takes, before another one is chosen
 class Link:
     """Learns from each frame: bytes per second, and how much each codec makes of what is sent."""
 
-    def __init__(self, codecs: Collection[str], fixed: str | None = None) -> None:
-        self._codecs = [name for name in live.available() if name in codecs]
+    def __init__(self, known: Collection[str], fixed: str | None = None) -> None:
+        self._codecs = [name for name in live.available() if name in known]
         self._ratio = {name: _MEASURED[name][0] for name in self._codecs}
         self._rates: deque[float] = deque(maxlen=_KEPT)
         self._fixed = fixed
         self.codec = fixed or ("lz4" if "lz4" in self._codecs else "deflate")
+
+    def learn(self, planes: Iterable[NDArray[Any]]) -> None:
+        """What each codec makes of a strip of these planes: pictures differ more than codecs."""
+        strips = [plane[len(plane) // 2 :][:_STRIP] for plane in planes]
+        before = sum(strip.nbytes for strip in strips)
+        for codec in self._codecs:
+            after = sum(len(codecs.encode(strip, codec)) for strip in strips)
+            self._ratio[codec] = before / max(after, 1)
 
     @property
     def bytes_s(self) -> float | None:

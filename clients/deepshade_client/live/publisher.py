@@ -12,7 +12,12 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage
+from websockets.exceptions import (
+    ConnectionClosed,
+    InvalidHandshake,
+    InvalidMessage,
+    InvalidStatus,
+)
 from websockets.typing import Subprotocol
 
 from deepshade import exr, live
@@ -31,7 +36,7 @@ from deepshade_client.live.pictures import LiveAnswer, Picture
 PROTOCOL = "deepshade.live.1"
 _FIRST, _LONGEST = 0.1, 1.0  # seconds between attempts
 _REST = 0.2  # seconds without a new picture, after which it is sent whole
-_IN_VAIN = {401, 403, 404, 409, 413, 422}
+_IN_VAIN = {401, 403, 404, 409, 413, 421, 422}
 _OUT = 4  # answers that may wait for who takes them, where each is wanted
 _MEASURE_FIRST, _MEASURE_EVERY = 8, 8  # frames whose way is timed
 
@@ -301,6 +306,8 @@ class Publisher:
         small = picture.smaller(step)
         self._ids += 1
         size = sum(plane.nbytes for plane in small.planes.values())
+        if self._ids == 1 and self._codec is None:
+            self._link.learn(small.planes.values())
         codec = self._link.choose(size)
         now = time.time()
         made = picture.made or now
@@ -425,7 +432,19 @@ def _read(message: str | bytes) -> dict[str, Any]:
 
 
 def _refusal(error: Exception) -> ClientError | None:
-    """What a close code says where trying again is in vain."""
+    """What a refused handshake or a close code says where trying again is in vain."""
+    if isinstance(error, InvalidStatus) and error.response.status_code in _IN_VAIN:
+        status = error.response.status_code
+        try:
+            document = json.loads(error.response.body or b"")
+        except ValueError:
+            document = None
+        if not isinstance(document, dict):
+            document = {
+                "detail": f"no live sessions are served there (HTTP {status})",
+                "fix": "is it a deepshade service, of this version, without a proxy before it?",
+            }
+        return problem(status, document, None)
     if isinstance(error, ConnectionClosed) and error.rcvd is not None:
         status = error.rcvd.code - 4000
         if status in _IN_VAIN:

@@ -20,7 +20,7 @@ from deepshade_service.live.connection import Connection
 from deepshade_service.live.history import History
 from deepshade_service.live.pipeline import Pipeline, source_time
 from deepshade_service.live.session import Session, Sessions
-from deepshade_service.live.tokens import Guard
+from deepshade_service.live.tokens import Tokens
 from deepshade_service.live.viewer import Outlet, Viewer
 from deepshade_service.models import not_ready
 from deepshade_service.parameters import ShadeParameters
@@ -33,7 +33,7 @@ _HELLO = 10.0  # seconds for the first message
 _STATUS = 1.0
 
 
-def install(app: FastAPI, service: Service, sessions: Sessions, guard: Guard) -> None:
+def install(app: FastAPI, service: Service, sessions: Sessions, tokens: Tokens) -> None:
     """Add the routes to `app`."""
 
     @app.websocket("/live/{name}/publish")
@@ -41,7 +41,7 @@ def install(app: FastAPI, service: Service, sessions: Sessions, guard: Guard) ->
         connection = Connection(socket)
         async with _told(connection):
             await connection.open()
-            guard.check(socket)
+            tokens.check(socket)
             await _publish(connection, name, service, sessions)
 
     @app.websocket("/live/{name}/view")
@@ -49,19 +49,19 @@ def install(app: FastAPI, service: Service, sessions: Sessions, guard: Guard) ->
         connection = Connection(socket)
         async with _told(connection):
             await connection.open()
-            guard.check_viewer(socket, name)
+            tokens.check_viewer(socket, name)
             await _view(connection, sessions.find(name))
 
     @app.get("/live", tags=["live"], summary="The live sessions, each with its last status")
     async def listed(request: Request) -> list[dict[str, Any]]:
-        guard.check(request)
+        tokens.check(request)
         return [{"session": each.name, **each.status(0)} for each in sessions.all()]
 
     @app.post("/live/{name}/link", tags=["live"], summary="A link for viewers, for an hour")
     async def link(request: Request, name: str) -> dict[str, Any]:
-        guard.check(request)
+        tokens.check(request)
         sessions.find(name)
-        token, expires = guard.link(name)
+        token, expires = tokens.link(name)
         return {"token": token, "path": f"/live/{name}#token={token}", "expires": expires}
 
 

@@ -7,18 +7,16 @@ import hashlib
 import hmac
 import time
 from collections.abc import Sequence
-from urllib.parse import urlsplit
 
 from starlette.requests import HTTPConnection
 
-from deepshade_service.config import is_loopback
 from deepshade_service.problems import Problem
 
 LIFE = 3600.0  # seconds that a link is good for
 _PROTOCOL_PREFIX = "token."
 
 
-class Guard:
+class Tokens:
     """Decides by a request's headers. Without a token everybody may: on loopback only.
 
     A link's token is "<expiry>.<HMAC-SHA256 of session and expiry>", with the operator's token as
@@ -51,7 +49,6 @@ class Guard:
                 fix="start it with DEEPSHADE_TOKEN=<a long secret>, or bound to 127.0.0.1",
             )
         if self._token is None:
-            check_site(request)
             return
         given = presented(request)
         if not any(self._valid(each, session) for each in given):
@@ -92,19 +89,3 @@ def presented(request: HTTPConnection) -> Sequence[str]:
     return found + [
         name.removeprefix(_PROTOCOL_PREFIX) for name in names if name.startswith(_PROTOCOL_PREFIX)
     ]
-
-
-def check_site(request: HTTPConnection) -> None:
-    """Raises Problem 403 for a page of another site, whose WebSockets no browser holds back.
-
-    Also for one whose name was made to mean this machine (DNS rebinding): only loopback counts.
-    """
-    host, origin = request.headers.get("host", ""), request.headers.get("origin")
-    other = origin is not None and urlsplit(origin).netloc != host
-    if other or not is_loopback(urlsplit(f"//{host}").hostname or ""):
-        raise Problem(
-            403,
-            "other-site",
-            f"the page at {str(origin or host)[:100]} is another site's",
-            fix="open the page that this service serves, at the address that it prints",
-        )
