@@ -257,6 +257,173 @@ def shade(
         raise typer.Exit(3 if unreached else 1)
 
 
+@app.command(epilog=EXIT_CODES)
+def stream(
+    effect: Annotated[str, typer.Argument(help="Which effect, as ao; or several, as ao,gi,dof.")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Frames as 'room.####.exr', a folder or a file; - for frames that a renderer "
+            "writes to stdin; or with --turntable a scene."
+        ),
+    ],
+    out: Annotated[
+        str | None,
+        typer.Option("--out", "-o", help="A folder, or a pattern with #### for the frame."),
+    ] = None,
+    live: Annotated[
+        str | None,
+        typer.Option(
+            "--live",
+            help="The session's name, for those who watch at /live/<name>.",
+            metavar="NAME",
+        ),
+    ] = None,
+    tev: Annotated[
+        str | None,
+        typer.Option(help="Show it in tev or HDRView, as 127.0.0.1:14158.", metavar="HOST:PORT"),
+    ] = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="SOURCE is a folder: shade what appears in it.")
+    ] = False,
+    turntable: Annotated[
+        bool,
+        typer.Option("--turntable", help="SOURCE is a scene: go around it (needs the workers)."),
+    ] = False,
+    frames: Annotated[int, typer.Option(min=1, help="Of a turn.")] = 96,
+    size: Annotated[str, typer.Option(help="Of a turntable's pictures.")] = "768x512",
+    focus_to: Annotated[
+        float | None, typer.Option(help="Focus in the middle of a turn; at first it is --focus.")
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=1000, help="Play a sequence at so many frames a second."),
+    ] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            min=1, max=240, help="Hold this rate by smaller pictures; whole ones when it rests."
+        ),
+    ] = None,
+    history: Annotated[
+        bool, typer.Option("--history", help="Take over from the answer before: less flicker.")
+    ] = False,
+    codec: Annotated[
+        Literal["raw", "lz4", "zstd", "deflate", "htj2k"] | None,
+        typer.Option(help="Of frames on the way. Default: by how fast the link is."),
+    ] = None,
+    radius: Annotated[
+        str | None, typer.Option(help="Effect radius: scene units, or a share of the depth as 15%.")
+    ] = None,
+    focus: Annotated[float | None, typer.Option(help="Distance in focus, scene units.")] = None,
+    aperture: Annotated[float | None, typer.Option(help="Lens diameter, scene units.")] = None,
+    shutter: Annotated[float | None, typer.Option(help="Open for so many frames.")] = None,
+    environment: Annotated[str | None, typer.Option(help="The map that lights the scene.")] = None,
+    rotate: Annotated[float | None, typer.Option(help="Degrees to turn it by.")] = None,
+    up: Annotated[Literal["y", "z"] | None, typer.Option(help="The world's up axis.")] = None,
+    fov: Annotated[float | None, typer.Option(help="Full horizontal angle, degrees.")] = None,
+    map_: Annotated[
+        list[str] | None,
+        typer.Option("--map", metavar="ATTR=CHANNEL", help="Where an attribute is; repeatable."),
+    ] = None,
+    profile: Annotated[str | None, typer.Option(help="Renderer whose names to expect.")] = None,
+    bundle: Annotated[str | None, typer.Option(help="Which of the effect's bundles.")] = None,
+    quality: Annotated[
+        Literal["fast", "balanced", "best"] | None, typer.Option(help="The bundle of that name.")
+    ] = None,
+    trust: Annotated[bool, typer.Option("--trust", help="Skip checks of the input.")] = False,
+    token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="DEEPSHADE_TOKEN", help="The service's, where it has one.", show_default=False
+        ),
+    ] = None,
+    patience: Annotated[
+        float, typer.Option(min=0, help="Seconds to try again when the service is gone.")
+    ] = 60.0,
+    server: Server = DEFAULT_SERVER,
+    as_json: AsJson = False,
+) -> None:
+    """Send frames as they come, and show or save the shaded ones at once.
+
+    With --out every frame is shaded; else the newest wins, and no lag builds up. Examples:
+
+      deepshade-client stream ao 'room.####.exr' -o ao/
+
+      deepshade-client stream ao,gi renders/ --watch --live shot
+
+      deepshade-client stream ao,gi,dof teapot.glb --turntable --aperture 0.1 --live pot
+
+      my-renderer | deepshade-client stream ao - --tev 127.0.0.1:14158
+    """
+    from secrets import token_hex
+
+    from deepshade.gbuffer.channels import parse_mapping
+    from deepshade_client.live import command
+    from deepshade_client.request import Options
+
+    turn: tuple[str, ...] | None = None
+    if turntable:
+        given = {"--focus": focus, "--focus-to": focus_to, "--aperture": aperture, "--fov": fov}
+        turn = (source, "--frames", str(frames), "--size", size, *(["--loop"] if loop else []))
+        turn += tuple(text for name, v in given.items() if v is not None for text in (name, str(v)))
+        focus = aperture = fov = None  # each of its frames says its own
+    plan = command.Plan(source, out, tev, watch, rate, loop and turn is None, turn)
+    plan.check(fps)
+    options = Options(
+        radius=radius,
+        focus=focus,
+        aperture=aperture,
+        shutter=shutter,
+        environment=environment,
+        rotate=rotate,
+        up=up,
+        fov=fov,
+        mapping=parse_mapping(map_ or []),
+        profile=profile,
+        bundle=bundle,
+        quality=quality,
+        trust=trust or None,
+    )
+    tally = command.Tally()
+    work = command.run(
+        plan,
+        server,
+        live or f"stream-{token_hex(4)}",
+        effect,
+        options,
+        quiet=as_json,
+        tally=tally,
+        fps=fps,
+        history=history,
+        codec=codec,
+        token=token,
+        patience=patience,
+    )
+    interrupted = False
+    try:
+        asyncio.run(work)
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        if as_json:
+            _print_json(tally.as_json())
+    if not as_json:
+        found = tally.as_json()
+        ages = found["age_ms"]
+        age = f", {ages['median']:.0f} ms old in the median, {ages['p95']:.0f} at most of 95 %"
+        rates = f", {found['fps']} a second" if found["fps"] else ""
+        typer.echo(
+            f"{found['answered']} answered{rates}, {found['dropped']} dropped{age if ages else ''}",
+            err=True,
+        )
+    if interrupted:
+        raise typer.Exit(130)
+    if tally.failed:
+        raise typer.Exit(1)
+
+
 @app.command()
 def effects(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
     """List the effects: their inputs, their settings with ranges, and the service's bundles.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import httpx
 
@@ -29,6 +29,10 @@ from deepshade_client.request import (
     transport_error,
 )
 from deepshade_client.settings import Retry, Timeout, default_server
+
+if TYPE_CHECKING:
+    from deepshade_client.live.pictures import LiveAnswer
+    from deepshade_client.live.pictures import Picture as LivePicture
 
 T = TypeVar("T")
 Waiting = Callable[[ClientError, float], None]
@@ -89,6 +93,23 @@ class Client:
         read; docs/service.md has an example. Also raises OSError for a file that can't be read.
         """
         return self._ask(shade_request(effect, picture, options, explain=True), read_object)
+
+    def stream(
+        self,
+        effect: Effects,
+        pictures: Iterable[LivePicture | Path | str],
+        options: Options | None = None,
+        **more: Any,
+    ) -> Iterator[LiveAnswer]:
+        """Answers for pictures as they come, over one connection, each stage at work all the time.
+
+        A picture is an EXR file, or a `live.Picture` of arrays. `more`: a `session` that others
+        can watch; `every=False`, the newest picture wins; `half`, `fps`, `history`, `token` and
+        what else `live.Publisher` takes. A link that breaks is mended. docs/streaming.md.
+        """
+        from deepshade_client.live.streams import stream_sync
+
+        return stream_sync(self.server, effect, pictures, options, **more)
 
     def effects(self) -> list[dict[str, Any]]:
         """Every effect: name, title, inputs, outputs, settings with ranges, and its bundles."""
@@ -200,6 +221,18 @@ class AsyncClient:
         """Like `Client.explain`; files are read in a thread."""
         request = await asyncio.to_thread(shade_request, effect, picture, options, explain=True)
         return await self._ask(request, read_object)
+
+    def stream(
+        self,
+        effect: Effects,
+        pictures: Iterable[LivePicture | Path | str] | AsyncIterable[LivePicture | Path | str],
+        options: Options | None = None,
+        **more: Any,
+    ) -> AsyncIterator[LiveAnswer]:
+        """Like `Client.stream`; `pictures` may be asynchronous."""
+        from deepshade_client.live.streams import stream
+
+        return stream(self.server, effect, pictures, options, **more)
 
     async def effects(self) -> list[dict[str, Any]]:
         """Like `Client.effects`."""

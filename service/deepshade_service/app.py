@@ -28,6 +28,9 @@ from deepshade_service.config import Settings, environment_limits
 from deepshade_service.described import errors
 from deepshade_service.environments import SHARE, Environments
 from deepshade_service.guard import Guard, cross_origin
+from deepshade_service.live import routes as live_routes
+from deepshade_service.live.session import Sessions
+from deepshade_service.live.tokens import Tokens
 from deepshade_service.memory import MemoryBudget
 from deepshade_service.middleware import Closing, Counting
 from deepshade_service.models import Models, find_effect, find_effects, not_ready
@@ -64,6 +67,8 @@ class Service:
             self.environments,
             self.stopping,
         )
+        self.sessions = Sessions(settings)
+        self.tokens = Tokens(settings.token, beyond=settings.beyond)
         self.telemetry = Telemetry(
             queued=lambda: self.workers.taken, held=lambda: self.uploads.held
         )
@@ -77,6 +82,7 @@ class Service:
         finally:
             for task in tasks:
                 task.cancel()
+            self.sessions.stop()
             await self.workers.stop()
             await asyncio.gather(*tasks, return_exceptions=True)
 
@@ -177,6 +183,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         return _effect(find_effect(effect).name, service.models)
 
     routes.install(app, service.environments, service.uploads, service.settings)
+    live_routes.install(app, service, service.sessions, service.tokens)
 
     @app.get(
         "/healthz", tags=["operation"], summary="Is the process alive?", responses=errors({})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import signal
 import socket
 from pathlib import Path
@@ -80,6 +81,18 @@ def serve(
             " own; '*' any; repeatable."
         ),
     ] = None,
+    token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="DEEPSHADE_TOKEN",
+            help="What who publishes live must show; needed where others can reach --host.",
+            show_default=False,
+        ),
+    ] = None,
+    live_sessions: Annotated[int, typer.Option(min=0, help="Most live sessions.")] = 8,
+    live_viewers: Annotated[int, typer.Option(min=0, help="Most viewers of each.")] = 32,
+    live_frame: Annotated[str, typer.Option(help="Largest live frame.")] = "64M",
+    live_rate: Annotated[int, typer.Option(min=1, help="Most live frames a second.")] = 240,
     log_level: Annotated[
         LogLevel, typer.Option(case_sensitive=False, help="The least that is logged.")
     ] = "info",
@@ -97,7 +110,7 @@ def serve(
     from deepshade.bundles import bundle_roots, overlooked
     from deepshade.errors import ConfigError
     from deepshade.machine import cpu_count
-    from deepshade_service.config import Settings, default_limits, default_memory
+    from deepshade_service.config import Settings, default_limits, default_memory, is_loopback
     from deepshade_service.memory import parse_size
     from deepshade_service.models import check_backend
 
@@ -133,9 +146,33 @@ def serve(
         grace=grace,
         hosts=allow_host or (),
         origins=allow_origin or (),
+        live_sessions=live_sessions,
+        live_viewers=live_viewers,
+        live_frame=parse_size(live_frame),
+        live_rate=live_rate,
+        token=_checked_token(token),
+        beyond=not is_loopback(host),
     )
+    if settings.beyond and settings.token is None and live_sessions:
+        typer.echo(
+            "live sessions are closed: others can reach this service, and it has no token; "
+            "set DEEPSHADE_TOKEN to a long secret, or leave out --host",
+            err=True,
+        )
     with listen(host, port) as listener:
         _run(settings, listener, log_level)
+
+
+def _checked_token(token: str | None) -> str | None:
+    from deepshade.errors import ConfigError
+
+    if token is not None and not re.fullmatch(r"[\w.~-]{16,256}", token, re.ASCII):
+        raise ConfigError(
+            "token",
+            detail="the token must be 16 to 256 letters, digits or - . _ ~, as of"
+            " `openssl rand -hex 32`",
+        )
+    return token
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -181,6 +218,10 @@ def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
         # Without it uvicorn waits for open sockets for ever.
         timeout_graceful_shutdown=max(1, round(settings.grace)),
         server_header=False,
+        ws_max_size=settings.live_frame,
+        ws_per_message_deflate=False,  # frames are compressed by what knows them
+        ws_ping_interval=4.0,  # who vanishes without a word shall leave no session
+        ws_ping_timeout=8.0,
     )
     # uvicorn shuts down at SIGINT and SIGTERM and raises them again afterwards. By then all is
     # tidy, so they shall neither print a traceback nor turn a clean end into a failure.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -50,6 +51,11 @@ class Settings:
     which requests may add more if `environment_uploads`; those prepared may take a quarter of
     `memory` besides. `hosts` are names that the service goes by, `origins` those whose pages may
     use it, beside its own (`guard.Guard`).
+
+    Of live sessions: how many, how many `live_viewers` each, the bytes of a frame, and how many a
+    second a publisher may send. `token` is what publishers show, and viewers, if they have no
+    link; `beyond` says that the service can be reached from other machines, where there are none
+    without it.
     """
 
     models: Path | Sequence[Path] = field(default_factory=bundle_roots)
@@ -69,12 +75,18 @@ class Settings:
     grace: float = 20.0
     hosts: Sequence[str] = ()
     origins: Sequence[str] = ()
+    live_sessions: int = 8
+    live_viewers: int = 32
+    live_frame: int = 64 * MIB
+    live_rate: int = 240
+    token: str | None = field(default=None, repr=False)
+    beyond: bool = False
 
     def __post_init__(self) -> None:
         most = 2 * self.limits.body_bytes
         if self.uploads == 0:
             object.__setattr__(self, "uploads", max(default_uploads(), most))
-        for key in ("threads", "workers", "memory", "uploads", "files"):
+        for key in ("threads", "workers", "memory", "uploads", "files", "live_frame", "live_rate"):
             _require(key, getattr(self, key) >= 1, "at least 1")
         _require(
             "uploads",
@@ -89,6 +101,14 @@ class Settings:
         _require("queue", self.queue >= 0, "0 or more")
         for key in ("body_timeout", "idle_trim", "grace"):
             _require(key, getattr(self, key) > 0, "more than 0 seconds")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach what listens at `host`."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def _require(key: str, ok: bool, range_: str) -> None:

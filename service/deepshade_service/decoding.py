@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -14,11 +15,22 @@ from deepshade.errors import MissingAttributeError
 from deepshade.gbuffer import GBuffer, load_gbuffers
 from deepshade_service.parameters import LENS, ShadeParameters, Share
 from deepshade_service.problems import Problem
-from deepshade_service.uploads import Upload
+
+
+class Source(Protocol):
+    """What a file or a live frame is called, and what it holds."""
+
+    @property
+    def name(self) -> str:
+        """Its file name, or ""."""
+
+    @property
+    def data(self) -> bytes | exr.Planes:
+        """An EXR file's bytes, or planes."""
 
 
 def read_headers(
-    files: Sequence[Upload], asked: ShadeParameters, limits: exr.Limits
+    files: Sequence[Source], asked: ShadeParameters, limits: exr.Limits
 ) -> list[exr.Header]:
     """The files' checked headers, in which lens and camera are those asked for.
 
@@ -35,7 +47,7 @@ def read_headers(
 
 
 def decode(
-    files: Sequence[Upload],
+    files: Sequence[Source],
     headers: Sequence[exr.Header],
     bundles: Sequence[Bundle],
     asked: ShadeParameters,

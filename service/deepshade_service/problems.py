@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
@@ -88,13 +88,7 @@ def as_query(text: str, parameters: Collection[str]) -> str:
 def respond(problem: Problem) -> JSONResponse:
     """The problem as a response."""
     return JSONResponse(
-        {
-            "type": type_uri(problem.kind),
-            "title": HTTPStatus(problem.status).phrase,
-            "status": problem.status,
-            "detail": problem.detail,
-            **problem.more,
-        },
+        document(problem),
         status_code=problem.status,
         media_type=MEDIA_TYPE,
         headers=problem.headers,
@@ -126,17 +120,7 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _(request: Request, error: RequestValidationError) -> JSONResponse:
-        errors = [
-            {
-                "where": ".".join(str(step) for step in entry["loc"]),
-                "problem": _said(entry),
-                "got": str(entry.get("input"))[:200],
-            }
-            for entry in error.errors()
-        ]
-        detail = "; ".join(f"{entry['where']}: {entry['problem']}" for entry in errors)
-        fix = "; ".join(filter(None, (_fix(entry, parameters) for entry in error.errors())))
-        return respond(Problem(422, "bad-parameter", detail, fix=fix, errors=errors))
+        return respond(invalid(error.errors(), parameters))
 
     @app.exception_handler(ClientDisconnect)
     async def _(request: Request, error: ClientDisconnect) -> Response:
@@ -154,6 +138,32 @@ def install(app: FastAPI, parameters: Collection[str]) -> None:
                 fix="report it with the request that caused it",
             )
         )
+
+
+def invalid(found: Sequence[Mapping[str, Any]], parameters: Collection[str]) -> Problem:
+    """Problem 422 for what pydantic found wrong with parameters, of which there are these."""
+    errors = [
+        {
+            "where": ".".join(str(step) for step in entry["loc"]),
+            "problem": _said(entry),
+            "got": str(entry.get("input"))[:200],
+        }
+        for entry in found
+    ]
+    detail = "; ".join(f"{entry['where']}: {entry['problem']}" for entry in errors)
+    fix = "; ".join(filter(None, (_fix(entry, parameters) for entry in found)))
+    return Problem(422, "bad-parameter", detail, fix=fix, errors=errors)
+
+
+def document(problem: Problem) -> dict[str, Any]:
+    """The problem document (RFC 9457)."""
+    return {
+        "type": type_uri(problem.kind),
+        "title": HTTPStatus(problem.status).phrase,
+        "status": problem.status,
+        "detail": problem.detail,
+        **problem.more,
+    }
 
 
 def _said(error: Mapping[str, Any]) -> str:

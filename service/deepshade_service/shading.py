@@ -126,10 +126,20 @@ class Shader:
             return Shaded(content, media_type, made, watch.milliseconds)
 
         headers = await self.workers.run(read)
-        jobs = await unless(self.stopping.wait(), _stopping(), self._jobs(headers, asked, effects))
+        jobs = await self.jobs(headers, asked, effects)
         held = max(job.need.total for job in jobs)
         async with self.memory.hold(held):
             return await self.workers.run(_giving_back(jobs, held)(work))
+
+    async def jobs(
+        self, headers: list[exr.Header], asked: ShadeParameters, effects: list[list[Candidate]]
+    ) -> list[Job]:
+        """What shades each effect of a picture with these headers, its network loaded.
+
+        Raises Problem, 503 where the service stops meanwhile.
+        """
+        jobs = self._jobs(headers, asked, effects)
+        return await unless(self.stopping.wait(), _stopping(), jobs)
 
     async def _jobs(
         self, headers: list[exr.Header], asked: ShadeParameters, effects: list[list[Candidate]]

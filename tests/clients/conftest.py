@@ -20,3 +20,4 @@ make_picture = _fixtures.make_picture
 service = _fixtures.service
 start = _fixtures.start
 start_server = _fixtures.start_server
+wait_until = _fixtures.wait_until

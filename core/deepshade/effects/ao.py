@@ -16,4 +16,5 @@ EFFECT = Effect(
     contrast="deviation",
     min_contrast=0.12,
     settings=("radius",),
+    history=0.8,
 )

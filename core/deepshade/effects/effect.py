@@ -36,7 +36,8 @@ class Effect:
 
     `settings` name what a user sets (`deepshade.effects.settings`). `symmetries` are the turns and
     mirrors that a view may be learnt in: all 8, but where world-space directions would be
-    mirrored against camera-space ones.
+    mirrored against camera-space ones. `history` is how much of a moving picture's answer may be
+    that of the frame before; 0 where it gains nothing.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Effect:
     min_contrast: float = 0.02
     settings: tuple[str, ...] = ()
     symmetries: tuple[int, ...] = ALL
+    history: float = 0.0
 
     def __post_init__(self) -> None:
         for name in self.inputs:

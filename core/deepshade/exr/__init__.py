@@ -4,6 +4,7 @@ from deepshade.exr.chunks import Window
 from deepshade.exr.header import Header, Part
 from deepshade.exr.image import COMPRESSIONS, Image, fetch, read, read_header, write
 from deepshade.exr.limits import Limits
+from deepshade.exr.planes import Planes
 
 __all__ = [
     "COMPRESSIONS",
@@ -11,6 +12,7 @@ __all__ = [
     "Image",
     "Limits",
     "Part",
+    "Planes",
     "Window",
     "fetch",
     "read",

@@ -22,6 +22,7 @@ from deepshade.exr.decode import Wanted, decode
 from deepshade.exr.entries import Entry
 from deepshade.exr.header import MAX_COORDINATE, WRITABLE, Header, parse
 from deepshade.exr.limits import Limits
+from deepshade.exr.planes import Planes
 from deepshade.files import replacing
 from deepshade.threads import thread_count
 
@@ -52,24 +53,26 @@ class Image:
         return np.stack(planes) if block is None else block
 
 
-def read_header(source: Path | str | bytes, limits: Limits | None = None) -> Header:
-    """The checked header of an EXR file or of its bytes; no pixel is decoded.
+def read_header(source: Path | str | bytes | Planes, limits: Limits | None = None) -> Header:
+    """The checked header of an EXR file, of its bytes, or of planes; no pixel is decoded.
 
     Limits, windows, and whether every chunk really lies in the file are checked here.
     Raises ImageError, DamagedImageError, LimitError.
     """
     limits = limits or Limits()
+    if isinstance(source, Planes):
+        return source.header(limits)
     return parse(memoryview(fetch(source, limits)), limits)
 
 
 def read(
-    source: Path | str | bytes,
+    source: Path | str | bytes | Planes,
     channels: Collection[str] | None = None,
     limits: Limits | None = None,
     *,
     header: Header | None = None,
 ) -> Image:
-    """Decodes an EXR file, or its bytes, into float32 (half and uint are converted).
+    """Decodes an EXR file, its bytes, or planes into float32 (half and uint are converted).
 
     `channels` selects, and orders in memory, the wanted ones by their `Header.channels()`
     names; None is all. Parts with none of them are not decoded, and of the others only a strip at
@@ -77,8 +80,8 @@ def read(
     bytes, to spare reading it again. Raises ImageError, DamagedImageError, LimitError.
     """
     limits = limits or Limits()
-    data = fetch(source, limits)
-    header = header or parse(memoryview(data), limits)
+    data = source if isinstance(source, Planes) else fetch(source, limits)
+    header = header or read_header(data, limits)
     places = header.channels()
     wanted = list(places) if channels is None else list(dict.fromkeys(channels))
     for name in wanted:
@@ -97,6 +100,8 @@ def read(
         for shape, count in Counter(shapes.values()).items()
     }
     pixels = {name: next(blocks[shape]) for name, shape in shapes.items()}
+    if isinstance(data, Planes):
+        return Image(header, pixels, frozenset(data.fill(pixels)))
     jobs: dict[int, Wanted] = {}
     for name in wanted:
         index, channel = places[name]

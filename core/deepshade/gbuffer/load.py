@@ -24,7 +24,7 @@ from deepshade.gbuffer.lenses import number
 from deepshade.gbuffer.mixtures import unmix
 from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
 from deepshade.gbuffer.poses import find_pose
-from deepshade.gbuffer.reading import Read, Source, fetch, read_choices
+from deepshade.gbuffer.reading import Body, Read, Source, fetch, read_choices
 from deepshade.gbuffer.repair import repair
 from deepshade.gbuffer.sources import passed_over
 
@@ -68,7 +68,7 @@ def load_gbuffers(
 ) -> Generator[GBuffer]:
     """Loads one EXR file, or several of one view, for each of `needs`: names of attributes.
 
-    A source is a path, the bytes of a file, or (file name, bytes). `profile` names the renderer
+    A source is a path, the bytes of a file, or (file name, bytes or planes). `profile` names the renderer
     (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
     comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees, of
     another `projection` an orthographic one is `ortho_width` scene units wide. `view` names one of
@@ -165,7 +165,7 @@ def _job(
 
 def _load(
     jobs: Sequence[_Job],
-    bodies: Sequence[bytes],
+    bodies: Sequence[Body],
     headers: Sequence[Header],
     limits: Limits,
     read: Read,
@@ -223,7 +223,7 @@ def _matrix(plan: Plan) -> NDArray[np.float64]:
 
 def _together(
     jobs: Sequence[_Job],
-    bodies: Sequence[bytes],
+    bodies: Sequence[Body],
     headers: Sequence[Header],
     limits: Limits,
     read: Read,

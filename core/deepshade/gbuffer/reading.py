@@ -16,7 +16,8 @@ from deepshade.exr import Header, Limits
 from deepshade.gbuffer import channels
 from deepshade.gbuffer.profiles import QUANTITIES
 
-Source = Path | str | bytes | tuple[str, bytes]
+Body = bytes | exr.Planes
+Source = Path | str | bytes | tuple[str, Body]
 # quantities that were read to choose between them, and whether they hold NaN or infinities
 Read = dict[channels.Choice, tuple[NDArray[np.float32], bool]]
 
@@ -26,13 +27,15 @@ def source_name(field: str, filename: str) -> str:
     return f"{field}.exr" if field in QUANTITIES else filename
 
 
-def fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str], list[bytes]]:
+def fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str], list[Body]]:
     """(the files' names without suffix, their bytes). Raises ImageError, LimitError."""
     if isinstance(sources, str | bytes | Path) or (
         isinstance(sources, tuple) and [type(item) for item in sources] == [str, bytes]
     ):
         sources = [cast(Source, sources)]
-    stems, bodies, total = [], [], 0
+    stems: list[str] = []
+    bodies: list[Body] = []
+    total = 0
     for source in sources:
         name = source[0] if isinstance(source, tuple) else source
         stems.append("" if isinstance(name, bytes) else Path(name).stem)
@@ -45,7 +48,7 @@ def fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str]
 
 
 def read_choices(
-    bodies: Sequence[bytes],
+    bodies: Sequence[Body],
     headers: Sequence[Header],
     choices: Mapping[str, channels.Choice],
     limits: Limits,

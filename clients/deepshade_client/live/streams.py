@@ -1,0 +1,132 @@
+"""`Client.stream`: answers for pictures, as an iterator, for asyncio and without."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import secrets
+import threading
+from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from deepshade_client.live.pictures import LiveAnswer, Picture, read_picture
+from deepshade_client.live.publisher import Publisher
+from deepshade_client.request import Effects, Options
+
+Pictures = Iterable[Picture | Path | str]
+
+_AHEAD = 4  # answers that wait for a loop that isn't asyncio's
+
+
+async def stream(
+    server: str,
+    effects: Effects,
+    pictures: Pictures | AsyncIterable[Picture | Path | str],
+    options: Options | None = None,
+    *,
+    session: str | None = None,
+    every: bool = True,
+    **more: Any,
+) -> AsyncIterator[LiveAnswer]:
+    """The answers for pictures. `more` are those of `Publisher`."""
+    names = effects if isinstance(effects, str) else ",".join(effects)
+    settings = settings_of(options)
+    name = session or f"stream-{secrets.token_hex(4)}"
+    publisher = Publisher(server, name, names, settings, every=every, **more)
+    feeding = asyncio.ensure_future(_feed(publisher, pictures, options))
+    try:
+        async for answer in publisher.answers():
+            yield answer
+        if feeding.done():
+            feeding.result()
+    finally:
+        feeding.cancel()
+        with suppress(asyncio.CancelledError):
+            await feeding
+
+
+def stream_sync(
+    server: str, effects: Effects, pictures: Pictures, options: Options | None, **more: Any
+) -> Iterator[LiveAnswer]:
+    """The same without asyncio: an event loop in a thread, which ends with the iterator."""
+    ready: queue.Queue[LiveAnswer | BaseException | None] = queue.Queue(_AHEAD)
+    stopping = threading.Event()
+
+    async def run() -> None:
+        async for answer in stream(server, effects, pictures, options, **more):
+            while not stopping.is_set():
+                with suppress(queue.Full):
+                    ready.put_nowait(answer)
+                    break
+                await asyncio.sleep(0.002)
+            if stopping.is_set():
+                return
+
+    def work() -> None:
+        end: BaseException | None = None
+        try:
+            asyncio.run(run())
+        except BaseException as error:
+            end = error
+        while not stopping.is_set():
+            with suppress(queue.Full):
+                ready.put(end, timeout=0.1)
+                return
+
+    thread = threading.Thread(target=work, name="deepshade-live", daemon=True)
+    thread.start()
+    try:
+        while (found := ready.get()) is not None:
+            if isinstance(found, BaseException):
+                raise found
+            yield found
+    finally:
+        stopping.set()
+        thread.join()
+
+
+def settings_of(options: Options | None) -> dict[str, Any]:
+    """Options as the settings of a live frame."""
+    settings: dict[str, Any] = {}
+    for name, value in (options or Options()).query():
+        if name in ("map", "axes", "derive"):
+            settings.setdefault(name, []).append(value)
+        else:
+            settings[name] = value
+    return settings
+
+
+async def _feed(
+    publisher: Publisher,
+    pictures: Pictures | AsyncIterable[Picture | Path | str],
+    options: Options | None,
+) -> None:
+    """Offer all pictures; files are read in threads, with the channels that are needed."""
+    how = {"mapping": options.mapping, "profile": options.profile} if options else {}
+
+    async def offer(picture: Picture | Path | str) -> None:
+        if not isinstance(picture, Picture):
+            needs = await asyncio.shield(publisher.inputs)
+            file = Path(picture)
+            picture = await asyncio.to_thread(
+                read_picture,
+                [file],
+                needs,
+                name=file.stem,
+                **how,  # type: ignore[arg-type]
+            )
+        await publisher.offer(picture)
+
+    try:
+        if isinstance(pictures, AsyncIterable):
+            async for each in pictures:
+                await offer(each)
+        else:
+            iterator = iter(pictures)
+            end = object()
+            while (each := await asyncio.to_thread(next, iterator, end)) is not end:
+                await offer(each)  # type: ignore[arg-type]
+    finally:
+        publisher.finish()
