@@ -185,9 +185,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     routes.install(app, service.environments, service.uploads, service.settings)
     live_routes.install(app, service, service.sessions, service.tokens)
 
-    @app.get(
-        "/healthz", tags=["operation"], summary="Is the process alive?", responses=errors({})
-    )
+    @app.get("/healthz", tags=["operation"], summary="Is the process alive?", responses=errors({}))
     async def healthz() -> dict[str, str]:
         return {"status": "ok"}
 

@@ -68,8 +68,8 @@ def load_gbuffers(
 ) -> Generator[GBuffer]:
     """Loads one EXR file, or several of one view, for each of `needs`: names of attributes.
 
-    A source is a path, the bytes of a file, or (file name, bytes or planes). `profile` names the renderer
-    (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
+    A source is a path, the bytes of a file, or (file name, bytes or planes). `profile` names the
+    renderer (`profiles.PROFILES`), found from the header by default. `mapping` says which layer or
     comma-separated channels hold an attribute; `fov` is the full horizontal angle in degrees, of
     another `projection` an orthographic one is `ortho_width` scene units wide. `view` names one of
     the views of stereo files, or a part; without it the default one is read.
