@@ -27,6 +27,7 @@ _OPTIONS = {
     "channels": "--max-channels",
     "files": "--max-files",
     "memory_bytes": "--memory",
+    "kept_bytes": "--keep",
 }
 _SWITCHES = ("strict", "trust")  # which commands take without a value
 
