@@ -49,6 +49,10 @@ def install(app: FastAPI) -> None:
     async def index(request: Request) -> Response:
         return send("index.html", request)
 
+    @app.get("/live/{session}", include_in_schema=False)
+    async def live(session: str, request: Request) -> Response:
+        return send("live.html", request)  # which says so where there is no such session
+
     @app.get("/page/{name}", include_in_schema=False)
     async def part(name: str, request: Request) -> Response:
         if name not in found:

@@ -74,7 +74,8 @@ async function settle() {
   const from = source;
   if (!chosenByHand) chosen.b = usual();
   offer();
-  $('multiplied').hidden = effect.light;
+  const beauty = from.held.layers.some(each => each.attribute === 'beauty' || String(each.channels) === 'R,G,B');
+  $('multiplied').hidden = effect.light || !beauty;
   settings.show(effect, from.scene ?? SCENE);
   fresh = true;
   // the reference first, for it is there at once; lengths wait until something is seen
@@ -158,14 +159,22 @@ async function showSide(side) {
   }
   if (chosen[side] !== value || source !== from || !viewer) return;  // chosen anew meanwhile
   viewer.show(side, picture);
+  if (fresh && value !== ANSWER && hasReference()) exposeFor(picture);
   label();
+}
+
+/** An exposure that suits the first picture of an effect, unless somebody has chosen one. */
+function exposeFor(picture) {
+  if (tools && !tools.touched) tools.expose(effect.light ? picture.autoExposure() : 0);
 }
 
 function label() {
   for (const side of ['a', 'b']) {
     const {select} = tools.selects[side];
-    $(`name${side.toUpperCase()}`).textContent = viewer.pictures[side] ? select.selectedOptions[0]?.textContent ?? '' : '';
+    $(`name${side.toUpperCase()}`).textContent = viewer.pictures[side] ? select.selectedOptions[0]?.textContent ?? ''
+      : shading ? 'shading …' : '';
   }
+  tools.alone(!viewer.pictures.a || !viewer.pictures.b);
   const {a, b} = viewer.pictures, apart = a && b && a !== b ? compare(a, b) : null;
   $('apart').textContent = apart ? `mean |A − B| ${digits(apart.mean, 3)}, bias ${digits(apart.bias, 3)}` : '';
   $('canvas').setAttribute('aria-label', `A: ${$('nameA').textContent}. B: ${$('nameB').textContent}. Arrow keys move a cursor from pixel to pixel.`);
@@ -214,6 +223,7 @@ async function shade() {
   }
   shading = true;
   const timer = setTimeout(() => busy('Shading …'), 150);
+  if (viewer && !answer) label();
   try {
     do {
       again = false;
@@ -225,6 +235,7 @@ async function shade() {
     clearTimeout(timer);
     shading = false;
     busy();
+    if (viewer) label();
   }
   if (again) shade();
 }
@@ -240,7 +251,7 @@ async function shadeOnce() {
   const picture = Picture.from(body, effect.light ? 'light' : 'factor');
   answer = picture;
   clearProblem();
-  if (fresh && tools && !tools.touched) tools.expose(effect.light ? picture.autoExposure() : 0);
+  if (fresh) exposeFor(picture);
   fresh = false;
   for (const side of ['a', 'b']) if (chosen[side] === ANSWER) viewer?.show(side, picture);
   if (viewer) label();

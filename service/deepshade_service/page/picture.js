@@ -11,24 +11,31 @@ const SAMPLES = 1 << 16;  // pixels that statistics look at
 export const KINDS = ['light', 'factor', 'direction', 'range'];
 
 export class Picture {
-  /** `exr` is what readExr gives; without a `kind` it is guessed from the values. */
+  /** `exr` is what readExr gives; without a `kind` it is guessed from the values. `size` is the
+   *  picture's own where it is a smaller one of its `window`; a `bitmap` may stand for planes. */
   constructor(exr, kind) {
     Object.assign(this, exr);
     this.count = exr.names.length;
-    [this.x, this.y, this.width, this.height] = exr.window;
+    [this.x, this.y] = exr.window;
+    [this.width, this.height] = exr.size ?? exr.window.slice(2);
     // EXR sorts channels by name, people say R G B
     this.order = exr.names.join() === 'B,G,R' ? [2, 1, 0]
       : exr.names.join() === 'A,B,G,R' ? [3, 2, 1, 0] : exr.names.map((_, index) => index);
-    const range = this.findRange();
-    this.kind = kind ?? (range[0] < 0 && range[0] >= -1 && range[1] <= 1 ? 'direction' : 'range');
-    this.range = this.kind === 'range' ? range : [0, 1];
+    this.range = [0, 1];
+    this.kind = kind;
+    if (kind && kind !== 'range') return;
+    this.range = this.findRange();
+    const [low, high] = this.range;
+    this.kind ??= low < 0 && low >= -1 && high <= 1 ? 'direction' : 'range';
   }
 
   static from(buffer, kind) { return new Picture(readExr(buffer), kind); }
 
-  /** The values of a pixel of the frame, in order; null outside. */
+  /** The values at a pixel of the frame, in order; null outside, and of 8 bits for eyes. */
   at(x, y) {
-    const column = x - this.x, row = y - this.y;
+    const column = Math.floor((x - this.x) * this.width / this.window[2]);
+    const row = Math.floor((y - this.y) * this.height / this.window[3]);
+    if (this.bitmap) return null;
     if (column < 0 || row < 0 || column >= this.width || row >= this.height) return null;
     return this.order.map(channel => this.value(channel, row * this.width + column));
   }
@@ -74,8 +81,9 @@ export function share(sorted, part) {
 /** `{mean, bias, pixels}` of the difference of two pictures where both have finite values; channels
  *  are averaged, and one channel counts for all of the other's. null if there is no such pixel. */
 export function compare(a, b) {
-  const x0 = Math.max(a.x, b.x), x1 = Math.min(a.x + a.width, b.x + b.width);
-  const y0 = Math.max(a.y, b.y), y1 = Math.min(a.y + a.height, b.y + b.height);
+  if (a.bitmap || b.bitmap) return null;
+  const x0 = Math.max(a.x, b.x), x1 = Math.min(a.x + a.window[2], b.x + b.window[2]);
+  const y0 = Math.max(a.y, b.y), y1 = Math.min(a.y + a.window[3], b.y + b.window[3]);
   const channels = Math.min(3, Math.max(a.count, b.count));
   const step = Math.max(1, Math.floor((x1 - x0) * (y1 - y0) / SAMPLES)) | 1;
   let mean = 0, bias = 0, pixels = 0, turn = 0;

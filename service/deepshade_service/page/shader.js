@@ -14,7 +14,8 @@ precision highp int;
 precision highp sampler2DArray;
 
 struct Side {
-  ivec4 box;     // x, y, width, height within the frame
+  vec4 box;      // x, y, width, height within the frame
+  ivec2 size;    // in texels: less than the box where it is a smaller picture of it
   int channels;
   int kind;      // light, factor, direction, range
   vec2 range;
@@ -37,10 +38,9 @@ const int MOST = 8;  // samples a side, when many pixels fall on one
 
 bool finite(vec4 v) { return !any(isnan(v)) && !any(isinf(v)); }
 
-// A pixel's values; w is 1, or 0 outside of the picture.
-vec4 texel(sampler2DArray pixels, Side side, ivec2 at) {
-  ivec2 p = at - side.box.xy;
-  if (any(lessThan(p, ivec2(0))) || any(greaterThanEqual(p, side.box.zw))) return vec4(0.);
+// A texel's values; w is 1, or 0 outside of the picture.
+vec4 texel(sampler2DArray pixels, Side side, ivec2 p) {
+  if (any(lessThan(p, ivec2(0))) || any(greaterThanEqual(p, side.size))) return vec4(0.);
   vec4 v = vec4(texelFetch(pixels, ivec3(p, side.order.x), 0).rrr, 1.);
   if (side.srgb) v.rgb = texelFetch(pixels, ivec3(p, 0), 0).rgb;
   else if (side.channels > 1) {
@@ -53,14 +53,17 @@ vec4 texel(sampler2DArray pixels, Side side, ivec2 at) {
 // Values of where the eye looks. Far away the mean of what falls on this spot, by up to MOST x MOST
 // samples; near by the pixel itself; in between a blend of neighbours. w is how much of it is
 // there, and negative where a number isn't finite.
-vec4 look(sampler2DArray pixels, Side side, vec2 at) {
-  if (zoom >= 4. || zoom == 1.) {
+vec4 look(sampler2DArray pixels, Side side, vec2 frame) {
+  vec2 texels = vec2(side.size) / side.box.zw;
+  vec2 at = (frame - side.box.xy) * texels;
+  float near = zoom / texels.x;
+  if (near >= 4. || near == 1.) {
     vec4 v = texel(pixels, side, ivec2(floor(at)));
     return finite(v) ? v : vec4(0., 0., 0., -1.);
   }
   vec4 sum = vec4(0.);
   bool odd = false;
-  if (zoom > 1.) {
+  if (near > 1.) {
     vec2 corner = floor(at - .5), part = at - .5 - corner;
     for (int k = 0; k < 4; k++) {
       ivec2 step = ivec2(k & 1, k >> 1);
@@ -69,10 +72,10 @@ vec4 look(sampler2DArray pixels, Side side, vec2 at) {
       if (finite(v)) sum += v * w.x * w.y; else odd = true;
     }
   } else {
-    int n = min(MOST, int(ceil(1. / zoom)));
+    int n = min(MOST, int(ceil(1. / near)));
     for (int k = 0; k < n * n; k++) {
       vec2 spot = (vec2(k % n, k / n) + .5) / float(n) - .5;
-      vec4 v = texel(pixels, side, ivec2(floor(at + spot / zoom)));
+      vec4 v = texel(pixels, side, ivec2(floor(at + spot / near)));
       if (finite(v)) sum += v / float(n * n); else odd = true;
     }
   }

@@ -10,7 +10,7 @@ const EXPOSURES = 10;  // stops either way
 /** The toolbar of a viewer: `choose(side, value)` is called for a choice, `auto()` for an exposure. */
 export class Tools {
   constructor(root, viewer, {choose, auto}) {
-    Object.assign(this, {viewer, auto, touched: false});
+    Object.assign(this, {viewer, auto, touched: false, single: true, wipe: $('wipe')});
     this.selects = {a: this.select('A', choose), b: this.select('B', choose)};
     this.modes = el('fieldset', {className: 'modes'}, el('legend', {}, 'View'), ...MODES.map(mode =>
       el('label', {}, el('input', {type: 'radio', name: 'mode', value: mode, checked: mode === 'a'}),
@@ -32,13 +32,12 @@ export class Tools {
     this.level = el('output', {className: 'level'});
     root.append(
       el('div', {className: 'group sides'}, this.selects.a.label, this.modes, this.selects.b.label),
-      el('div', {className: 'group'}, el('span', {className: 'word'}, 'EV'), this.exposure, this.stops, automatic, this.curve),
-      el('div', {className: 'group'},
-        zoom('−', 'Zoom out (−)', () => viewer.zoomTo(viewer.zoom / 2)), this.level,
-        zoom('+', 'Zoom in (+)', () => viewer.zoomTo(viewer.zoom * 2)),
-        zoom('1:1', 'A pixel a pixel (1)', () => viewer.zoomTo(1)), zoom('Fit', 'The whole frame (0)', () => viewer.fit())));
+      el('div', {className: 'group'}, el('span', {className: 'word'}, 'EV'), this.exposure, this.stops, automatic, this.curve));
+    $('zoom').append(
+      zoom('−', 'Zoom out (−)', () => viewer.zoomTo(viewer.zoom / 2)), this.level,
+      zoom('+', 'Zoom in (+)', () => viewer.zoomTo(viewer.zoom * 2)),
+      zoom('1:1', 'A pixel a pixel (1)', () => viewer.zoomTo(1)), zoom('Fit', 'The whole frame (0)', () => viewer.fit()));
     viewer.addEventListener('view', () => { this.level.value = `${digits(100 * viewer.zoom, 3)} %`; });
-    this.wipe = $('wipe');
     this.listen();
     this.expose(0);
     this.mode('a');
@@ -62,11 +61,19 @@ export class Tools {
 
   mode(mode) {
     this.modes.querySelector(`[value=${mode}]`).checked = true;
-    this.wipe.hidden = mode !== 'wipe';
     document.body.dataset.mode = mode;
     this.viewer.set({mode});
+    this.placeWipe();
     this.wipeTo(this.viewer.state.wipe);
   }
+
+  /** With one picture alone there is nothing to wipe. */
+  alone(alone) {
+    this.single = alone;
+    this.placeWipe();
+  }
+
+  placeWipe() { this.wipe.hidden = this.single || this.viewer.state.mode !== 'wipe'; }
 
   /** Expose by so many stops; `touched`: somebody did, and no default changes it any more. */
   expose(stops, touched = false) {

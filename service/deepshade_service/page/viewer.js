@@ -157,6 +157,13 @@ export class Viewer extends EventTarget {
     });
   }
 
+  /** Until what was drawn is seen: browsers hold the next frame back while graphics are behind. A
+   *  page that nobody sees draws nothing, and waits `most` ms. */
+  seen(most = 300) {
+    const turn = () => new Promise(resolve => requestAnimationFrame(resolve));
+    return Promise.race([turn().then(turn), new Promise(resolve => setTimeout(resolve, most))]);
+  }
+
   /** Draw now; the pixels can be read until the browser composes them. */
   render() {
     const {gl, canvas, state} = this;
@@ -169,7 +176,8 @@ export class Viewer extends EventTarget {
     if (!b) mode = 0;
     if (!a) mode = 1;
     for (const [side, picture] of [['a', a ?? b], ['b', b ?? a]]) {
-      gl.uniform4i(this.at(`${side}.box`), picture.x, picture.y, picture.width, picture.height);
+      gl.uniform4f(this.at(`${side}.box`), ...picture.window);
+      gl.uniform2i(this.at(`${side}.size`), picture.width, picture.height);
       gl.uniform1i(this.at(`${side}.channels`), picture.count);
       gl.uniform1i(this.at(`${side}.kind`), KINDS.indexOf(picture.kind));
       gl.uniform2f(this.at(`${side}.range`), ...picture.range);

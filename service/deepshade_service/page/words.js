@@ -8,13 +8,13 @@ const listed = words => words.length < 2 ? words.join('')
 
 /** Sentences from a plan (docs/service.md, "What an answer says"). */
 export function planInWords(plan) {
-  const {pixels} = plan;
+  const {pixels} = plan;  // not of a stream, where they differ from frame to frame
   const sentences = [`The bundle “${plain(plan.bundle)}” on ${plan.engine} in ${plan.precision}:`
     + ` ${plain(plan.reason)}${plan.dssim == null ? '' : `; its published error is ${digits(plan.dssim, 3)} DSSIM`}.`];
   for (const [name, how] of Object.entries(plan.derived))
     sentences.push(`${name[0].toUpperCase()}${plain(name).slice(1)}: ${plain(how)}.`);
-  const all = pixels.width * pixels.height;
-  sentences.push(`${pixels.width} × ${pixels.height} pixels, of which ${pixels.background
+  const all = pixels?.width * pixels?.height;
+  if (pixels) sentences.push(`${pixels.width} × ${pixels.height} pixels, of which ${pixels.background
     ? `${count(pixels.background)} (${digits(100 * pixels.background / all, 2)} %) show no surface`
     : 'all show a surface'}; computed ${pixels.tiles === 1 ? 'at once' : `in ${pixels.tiles} tiles`}.`);
   const {decoded, in_file: there} = plan.channels;
