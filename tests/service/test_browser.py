@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import itertools
 import json
@@ -20,6 +21,7 @@ from deepshade import exr, live, pictures
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: make setup")
 websockets = pytest.importorskip("websockets.sync.client")
+websockets_errors = pytest.importorskip("websockets.exceptions")
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = [
@@ -258,11 +260,12 @@ class Publisher:
         self.id = 0
 
     def _listen(self):
-        for message in self.socket:
-            said = json.loads(message) if isinstance(message, str) else {}
-            if said.get("type") == "ping":
-                pong = {"type": "pong", "t": said["t"], "clock": time.time()}
-                self.socket.send(json.dumps(pong))
+        with contextlib.suppress(OSError, websockets_errors.ConnectionClosed):
+            for message in self.socket:
+                said = json.loads(message) if isinstance(message, str) else {}
+                if said.get("type") == "ping":
+                    pong = {"type": "pong", "t": said["t"], "clock": time.time()}
+                    self.socket.send(json.dumps(pong))
 
     def send(self, channels):
         self.id += 1

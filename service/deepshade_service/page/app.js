@@ -1,7 +1,7 @@
 // The page that shades: a picture comes in, settings change, the answer is looked at and taken along.
 
 import {$, bytes, digits, el, plain, say} from './dom.js';
-import {Picture, compare, kindOf, share} from './picture.js';
+import {FAR, Picture, compare, kindOf, share} from './picture.js';
 import {ask, json, Problem, Source} from './service.js';
 import {Settings} from './settings.js';
 import {curl, named, python} from './snippets.js';
@@ -19,7 +19,7 @@ let chosen = {a: ANSWER, b: null}, chosenByHand = false, modeByHand = false;
 let shading = false, again = false;
 let fresh = false;  // whether the answer to come is the first of its picture and effect
 
-const settings = new Settings($('settings'), () => shade());
+const settings = new Settings($('settings'), () => shade(), pickDistance);
 const {viewer, tools} = makeViewer();
 
 function makeViewer() {
@@ -82,7 +82,7 @@ async function settle() {
   await showSide('b');
   const shaded = shade();
   from.scene ??= await measure();
-  if (source === from) settings.show(effect, from.scene);
+  if (source === from) settings.rescale(from.scene);
   await shaded;
 }
 
@@ -112,10 +112,15 @@ function offer() {
   if (!modeByHand) tools.mode(hasReference() ? 'wipe' : 'a');
 }
 
+/** The layer whose last channel says how far surfaces are away; undefined if there is none. */
+function distances() {
+  const {layers: all} = source.held;
+  return ['depth', 'distance', 'position'].map(name => all.findIndex(layer => layer.attribute === name)).find(at => at >= 0);
+}
+
 /** The median depth of the picture, and the nearest and farthest: what lengths are measured by. */
 async function measure() {
-  const {layers: all} = source.held;
-  const index = ['depth', 'distance', 'position'].map(name => all.findIndex(layer => layer.attribute === name)).find(at => at >= 0);
+  const index = distances();
   if (index === undefined) return SCENE;
   try {
     const picture = await layer(index);
@@ -125,6 +130,28 @@ async function measure() {
   } catch {
     return SCENE;  // what is wrong with it is said when it is shaded
   }
+}
+
+/** How far what is clicked at is away, or what Enter chooses at the cursor; null at Escape. */
+async function pickDistance() {
+  const index = source && distances(), canvas = $('canvas');
+  if (!viewer || index === undefined) return null;
+  const picture = await layer(index);
+  $('values').value = 'Click at a surface. With keys: arrows and Enter; Escape leaves it.';
+  document.body.classList.add('picking');
+  canvas.focus();
+  const done = new AbortController(), {signal} = done;
+  const chosen = await new Promise(resolve => {
+    canvas.addEventListener('click', () => resolve(viewer.cursor), {signal});
+    addEventListener('keydown', ({key}) => {
+      if (key === 'Enter') resolve(viewer.cursor);
+      if (key === 'Escape') resolve(null);
+    }, {signal});
+  });
+  done.abort();
+  document.body.classList.remove('picking');
+  const found = chosen && Math.abs(picture.at(...chosen)?.at(-1));
+  return found > 0 && found < FAR ? found : null;
 }
 
 function layer(index) {

@@ -3,7 +3,7 @@
 import {readExr} from './exr.js';
 import {fromHalf} from './half.js';
 
-const FAR = 1e10;  // what the service takes for no surface
+export const FAR = 1e10;  // what the service takes for no surface
 const SAMPLES = 1 << 16;  // pixels that statistics look at
 
 /** How numbers are shown: radiance through exposure and a tone curve, factors as they are,

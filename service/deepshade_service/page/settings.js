@@ -9,10 +9,14 @@ const STEPS = 1000;  // of a slider
 const linear = (low, high) => [t => low + t * (high - low), v => (v - low) / (high - low)];
 const even = (low, high) => [t => low * (high / low) ** t, v => Math.log(v / low) / Math.log(high / low)];
 
+/** Whether a setting is how far something is away, as what is in focus. */
+const isDistance = ({unit, lowest, learnt}) => unit === 'scene units' && lowest > 0 && !learnt;
+
 export class Settings {
-  /** Controls go into `root`; `changed` is called when one is. */
-  constructor(root, changed) {
-    Object.assign(this, {root, changed, values: new Map(), shown: [], environments: []});
+  /** Controls go into `root`; `changed` is called when one is, and `pick` lets the user point at a
+   *  surface: it promises its distance, or null. */
+  constructor(root, changed, pick) {
+    Object.assign(this, {root, changed, pick, values: new Map(), shown: [], environments: []});
   }
 
   /** [name, value] of those that are set and that the effect has. */
@@ -25,6 +29,12 @@ export class Settings {
     Object.assign(this, {effect, scene});
     this.shown = effect.settings.map(setting => ({name: setting.name, ...this.control(setting)}));
     this.root.replaceChildren(...this.shown.map(each => each.row));
+  }
+
+  /** The scene was measured meanwhile: sliders span it, and whatever is being typed stays. */
+  rescale(scene) {
+    this.scene = scene;
+    for (const {follow} of this.shown) follow();
   }
 
   /** What the answer was made with, by its plan. */
@@ -57,12 +67,26 @@ export class Settings {
       this.changed();
       input.field.focus();
     });
-    const unit = choices ? '' : el('span', {className: 'unit'}, setting.unit);
+    const unit = choices ? '' : isDistance(setting) ? this.picker(setting, value => {
+      set(input.field.value = value);
+      input.follow();
+      this.changed();
+    }) : el('span', {className: 'unit'}, setting.unit);
     const row = el('div', {className: 'setting', title: setting.meaning},
       label, input.slider ?? '', input.field, unit, reset, input.more ?? '');
     set(input.field.value = this.values.get(setting.name) ?? '');
     input.follow();
-    return {row, use: input.use};
+    return {row, use: input.use, follow: input.follow};
+  }
+
+  picker(setting, take) {
+    const label = `Pick the ${setting.name} in the picture`;
+    const button = el('button', {type: 'button', className: 'pick', title: label, 'aria-label': label}, '⌖');
+    button.addEventListener('click', async () => {
+      const distance = await this.pick();
+      if (distance) take(String(Number(distance.toPrecision(4))));
+    });
+    return button;
   }
 
   select(setting, choices) {
@@ -78,15 +102,14 @@ export class Settings {
   }
 
   number(setting) {
-    const [value, share] = this.scale(setting);
     const slider = el('input', {type: 'range', min: 0, max: STEPS, 'aria-label': `${setting.name}, slider`});
     const field = el('input', {type: 'text', inputMode: 'decimal', autocomplete: 'off', spellcheck: false});
-    const read = () => String(Number(value(slider.value / STEPS).toPrecision(3)));
+    const read = () => String(Number(this.scale(setting)[0](slider.value / STEPS).toPrecision(3)));
     let usual = Number.isFinite(setting.default) ? setting.default : NaN;
     const follow = () => {
       const text = field.value;
       const now = text.endsWith('%') ? parseFloat(text) / 100 * this.scene.median : text ? Number(text) : usual;
-      const at = Math.round(STEPS * share(now));
+      const at = Math.round(STEPS * this.scale(setting)[1](now));
       slider.value = Number.isFinite(at) ? at : STEPS / 2;
       field.setAttribute('aria-invalid', text !== '' && !Number.isFinite(now));
       slider.setAttribute('aria-valuetext', Number.isFinite(now) ? `${digits(now, 3)} ${setting.unit}` : 'not set');
@@ -101,7 +124,8 @@ export class Settings {
     return {field, slider, follow, use, read};
   }
 
-  /** A length's slider spans what suits the scene, any other's what is allowed. */
+  /** [share to value, value to share]: a length's slider spans what suits the scene, any other's what
+   *  is allowed. */
   scale({unit, lowest, highest, learnt}) {
     const {median, near, far} = this.scene;
     if (unit === 'degrees') return linear(Math.max(lowest, -180), Math.min(highest, 180));
