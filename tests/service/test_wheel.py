@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -90,6 +91,17 @@ def test_it_serves_what_ships_to_the_bit(
     answer = own.client.post("/shade/ao?quality=fast", content=room.read_bytes(), headers=EXR)
     assert answer.status_code == 200
     assert (home / "ao.exr").read_bytes() == answer.content
+
+
+@pytest.mark.slow
+def test_the_pages_and_their_samples_are_in_the_wheel(server: str) -> None:
+    """Nothing of them comes from the repository, or from the internet."""
+    with httpx.Client(base_url=server, trust_env=False) as client:
+        for name in ("app.js", "live.js", "style.css", "icon.svg"):
+            served = client.get(f"/page/{name}")
+            assert served.content == (ROOT / "service/deepshade_service/page" / name).read_bytes()
+        assert client.get("/").status_code == client.get("/live/any").status_code == 200
+        assert client.get("/samples").json() == ["foliage", "room"]
 
 
 @pytest.mark.slow

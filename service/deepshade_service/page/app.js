@@ -16,7 +16,7 @@ const effects = new Map();
 let source = null, effect = null, answer = null;
 let layers = new Map();  // index -> promise of a Picture
 let chosen = {a: ANSWER, b: null}, chosenByHand = false, modeByHand = false;
-let shading = false, again = false;
+let shading = false, again = false, opening = null;
 let fresh = false;  // whether the answer to come is the first of its picture and effect
 
 const settings = new Settings($('settings'), () => shade(), pickDistance);
@@ -35,24 +35,26 @@ function makeViewer() {
 
 /* Pictures */
 
-/** Open files or a sample: its layers are looked at while it is shaded. */
-async function open(files, sample) {
+/** Open files or a sample: its layers are looked at while it is shaded. `quiet`: if it is there. */
+async function open(files, sample, quiet = false) {
   const opened = new Source(files, sample);
   clearProblem();
   busy('Sending …', 0);
   try {
     await opened.open(progress);
   } catch (error) {
-    return fail(error);
+    if (!(quiet && error.status === 404)) fail(error);
+    return;
   } finally {
     busy();
   }
+  if (quiet && source) return;  // somebody was quicker
   source = opened;
   layers = new Map();
   answer = null;
   chosenByHand = false;
   chosen = {a: ANSWER, b: null};
-  if (!sample) $('sample').value = '';
+  $('sample').value = sample ?? '';
   describe();
   viewer?.show('a', null);
   viewer?.show('b', null);
@@ -363,24 +365,22 @@ function chooseEffect(name) {
 }
 
 async function begin() {
+  const wanted = new URLSearchParams(location.hash.slice(1));
+  opening ??= open(null, wanted.get('sample') ?? FIRST_SAMPLE, !wanted.get('sample'));
   try {
     const [samples, found, maps] = await Promise.all([json('samples'), json('effects'), json('environments')]);
     settings.environments = maps.map(map => map.name);
     $('sample').replaceChildren(el('option', {value: ''}, '–'), ...samples.map(name => el('option', {value: name}, name)));
+    $('sample').value = source?.sample ?? '';
     for (const each of found.filter(each => each.bundles.length)) effects.set(each.name, each);
     if (!effects.size) {
       say($('lacks'), 'The service is still loading …', 'note');
       return void setTimeout(begin, 500);
     }
     $('effect').replaceChildren(...[...effects.values()].map(each => el('option', {value: each.name}, each.title)));
-    const wanted = new URLSearchParams(location.hash.slice(1));
     const most = [...effects.values()].reduce((best, each) => each.bundles.length > best.bundles.length ? each : best);
     chooseEffect(effects.has(wanted.get('effect')) ? wanted.get('effect') : most.name);
-    const sample = [wanted.get('sample'), FIRST_SAMPLE, samples[0]].find(name => samples.includes(name));
-    if (!source && sample) {
-      $('sample').value = sample;
-      await open(null, sample);
-    }
+    await settle();
   } catch (error) {
     fail(error);
   }

@@ -20,6 +20,7 @@ const token = new URLSearchParams(location.hash.slice(1)).get('token');
 const light = new Map();  // effect -> whether its answer is radiance
 const drawn = [];  // {at, age} of frames, in ms
 const got = [];  // {at, size} of messages
+let exposedFor = '';  // the effect that the exposure suits
 let waiting = null, decoding = false, paused = false, held = 0;
 let shown = null;  // the frame that is seen: its `time`, `flags`, when it was drawn
 let status = null, link = 'connecting', why = '';
@@ -72,7 +73,12 @@ async function show(frame) {
   const parts = await decode(frame, $('effect').value);
   const isLight = light.get(parts.effect) ?? !parts.names.includes('Y');
   const before = viewer.pictures.a;
-  viewer.show('a', new Picture(parts, isLight ? 'light' : 'factor'));
+  const picture = new Picture(parts, isLight ? 'light' : 'factor');
+  viewer.show('a', picture);
+  if (!picture.bitmap && exposedFor !== parts.effect && !tools.touched) {  // 8 bits say too little
+    tools.expose(isLight ? picture.autoExposure() : 0);
+    exposedFor = parts.effect;
+  }
   if (before !== viewer.pictures.b) before?.bitmap?.close();
   const now = performance.now(), again = shown?.id === frame.id;
   shown = {id: frame.id, time: frame.time, flags: frame.flags, at: again ? shown.at : now};

@@ -41,6 +41,7 @@ export class Tools {
     this.listen();
     this.expose(0);
     this.mode('a');
+    this.alone(true);
   }
 
   select(name, choose) {
@@ -70,6 +71,7 @@ export class Tools {
   /** With one picture alone there is nothing to wipe. */
   alone(alone) {
     this.single = alone;
+    for (const input of this.modes.querySelectorAll('input:not([value=a])')) input.disabled = alone;
     this.placeWipe();
   }
 
@@ -134,11 +136,11 @@ export class Tools {
       select.dispatchEvent(new Event('change'));
     };
     return {
-      a: ['A alone', () => this.mode('a')],
-      b: ['B alone', () => this.mode('b')],
-      f: ['flip between A and B', () => this.mode(viewer.state.mode === 'a' ? 'b' : 'a')],
-      w: ['wipe', () => this.mode('wipe')],
-      d: ['difference', () => this.mode('difference')],
+      a: ['A alone', () => this.single || this.mode('a')],
+      b: ['B alone', () => this.single || this.mode('b')],
+      f: ['flip between A and B', () => this.single || this.mode(viewer.state.mode === 'a' ? 'b' : 'a')],
+      w: ['wipe', () => this.single || this.mode('wipe')],
+      d: ['difference', () => this.single || this.mode('difference')],
       ',': ['previous layer as B', next(-1)],
       '.': ['next layer as B', next(1)],
       '[': ['a third of a stop darker', () => this.expose(viewer.state.exposure - 1 / 3, true)],

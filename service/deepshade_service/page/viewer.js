@@ -194,6 +194,8 @@ export class Viewer extends EventTarget {
     gl.uniform1f(this.at('wipe'), state.wipe * canvas.width);
     gl.uniform3f(this.at('surround'), ...state.surround);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+    if (!this.begun) performance.mark('first picture');
+    this.begun = true;
   }
 
   /** Put the cursor on a pixel of the frame, or nowhere (null); `seen` brings it into view. */
