@@ -35,6 +35,8 @@ FLAGS = [
     "--disable-sync",
 ]
 EXR = {"Content-Type": "image/x-exr"}
+PATIENCE = 60_000  # ms: nothing here is about time, and machines are busy
+playwright.expect.set_options(timeout=PATIENCE)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,7 @@ def new_page(browser):
     def new(**options):
         context = browser.new_context(**({"viewport": {"width": 900, "height": 560}} | options))
         page = context.new_page()
-        page.set_default_timeout(30_000)
+        page.set_default_timeout(PATIENCE)
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("dialog", lambda dialog: wrong.append(f"dialog: {dialog.message}"))
         page.on("console", lambda m: m.type == "error" and note(m))

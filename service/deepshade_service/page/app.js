@@ -51,13 +51,12 @@ async function open(files, sample, quiet = false) {
   if (quiet && source) return;  // somebody was quicker
   source = opened;
   layers = new Map();
-  answer = null;
   chosenByHand = false;
   chosen = {a: ANSWER, b: null};
   $('sample').value = sample ?? '';
-  describe();
-  viewer?.show('a', null);
   viewer?.show('b', null);
+  noAnswer();
+  describe();
   await settle();
 }
 
@@ -105,7 +104,7 @@ function offer() {
   const {layers: all} = source.held, several = source.held.files.length > 1;
   const entries = all.map((layer, index) => [String(index), plain(several ? `${layer.name} (${source.held.files[layer.file].name})` : layer.name)]);
   tools?.offer([
-    ['Made here', [[ANSWER, `answer: ${effect.title}`]]],
+    ['Made here', [[ANSWER, effect.title]]],
     ['References', entries.filter((_, index) => all[index].reference)],
     ['In the file', entries.filter((_, index) => !all[index].reference)],
   ]);
@@ -205,9 +204,19 @@ function label() {
   }
   tools.alone(!viewer.pictures.a || !viewer.pictures.b);
   const {a, b} = viewer.pictures, apart = a && b && a !== b ? compare(a, b) : null;
-  $('apart').textContent = apart ? `mean |A − B| ${digits(apart.mean, 3)}, bias ${digits(apart.bias, 3)}` : '';
+  $('apart').textContent = apart ? `mean |A − B| ${digits(apart.mean, 3)}, bias ${digits(apart.bias, 3)}${strays()}` : '';
   $('canvas').setAttribute('aria-label', `A: ${$('nameA').textContent}. B: ${$('nameB').textContent}. Arrow keys move a cursor from pixel to pixel.`);
   values();
+}
+
+/** What the file's references were made with, where the answer was made with something else. */
+function strays() {
+  if (!answer || !Object.values(chosen).some(value => source.held.layers[value]?.reference)) return '';
+  const said = source.held.settings, used = answer.plan;
+  const other = effect.settings.map(({name}) => name).filter(name => name in said && used[name] !== undefined
+    && (typeof used[name] === 'number' ? Math.abs(used[name] - said[name]) > 1e-3 * Math.abs(said[name]) : used[name] !== said[name]));
+  const values = other.map(name => `${name} ${typeof said[name] === 'number' ? digits(said[name]) : plain(said[name])}`);
+  return other.length ? `; the reference has ${values.join(', ')}` : '';
 }
 
 function values() {
@@ -279,14 +288,14 @@ async function shadeOnce() {
   }
   const picture = Picture.from(body, effect.light ? 'light' : 'factor');
   answer = picture;
+  picture.plan = JSON.parse(picture.attributes['deepshade:plan']);
   clearProblem();
   if (fresh) exposeFor(picture);
   fresh = false;
   for (const side of ['a', 'b']) if (chosen[side] === ANSWER) viewer?.show(side, picture);
   if (viewer) label();
-  const plan = JSON.parse(picture.attributes['deepshade:plan']);
-  settings.used(plan);
-  tell(plan);
+  settings.used(picture.plan);
+  tell(picture.plan);
   $('timing').textContent = timingInWords(response.headers.get('server-timing'), performance.now() - start);
   for (const id of ['download', 'curl', 'python']) $(id).disabled = false;
 }
