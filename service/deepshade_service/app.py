@@ -8,11 +8,10 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from importlib.metadata import version
-from importlib.resources import files
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request, Response
-from fastapi.responses import HTMLResponse, PlainTextResponse
+from fastapi.responses import PlainTextResponse
 from fastapi_offline import FastAPIOffline
 
 from deepshade.attributes import ATTRIBUTES
@@ -20,14 +19,16 @@ from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS, SETTINGS, Setting
 from deepshade.engines import Engine
 from deepshade.errors import EngineError
+from deepshade.files import shipped
 from deepshade.machine import trim
-from deepshade_service import composition, problems
+from deepshade_service import composition, pages, problems, upload_routes
 from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
 from deepshade_service.described import errors
 from deepshade_service.environments import SHARE, Environments
 from deepshade_service.guard import Guard, cross_origin
+from deepshade_service.kept import Kept
 from deepshade_service.live import routes as live_routes
 from deepshade_service.live.session import Sessions
 from deepshade_service.live.tokens import Tokens
@@ -39,7 +40,7 @@ from deepshade_service.selection import allowed
 from deepshade_service.shading import Shader
 from deepshade_service.telemetry import MEDIA_TYPE as METRICS_TYPE
 from deepshade_service.telemetry import Telemetry, server_timing
-from deepshade_service.uploads import Uploads
+from deepshade_service.uploads import Upload, Uploads, refuse_body
 from deepshade_service.workers import Cancelled, Workers, unless
 
 
@@ -52,6 +53,7 @@ class Service:
         self.models = Models(settings.models, threads=settings.threads, pinned=pinned)
         self.workers = Workers(settings.workers, settings.queue)
         self.uploads = Uploads(settings)
+        self.kept = Kept(settings.keep, settings.keep_seconds, shipped("samples"))
         self.memory = MemoryBudget(settings.memory)
         self.environments = Environments(
             settings.environments,
@@ -95,7 +97,7 @@ class Service:
         if asked.environment is not None:
             self.environments.check(asked.environment)
         self.workers.check_place()  # before the body is received, to spare both sides the work
-        async with self.uploads.receive(request) as files:
+        async with self._files(request, asked) as files:
             with self.workers.place():
                 work = self.shader.shade(files, asked, candidates)
                 shaded = await unless(_gone(request), Cancelled(), work)
@@ -106,11 +108,23 @@ class Service:
             self.telemetry.shaded(made.effect, stages, made.pixels, made.computed, nonfinite)
         return shaded
 
+    @asynccontextmanager
+    async def _files(self, request: Request, asked: ShadeParameters) -> AsyncIterator[list[Upload]]:
+        """Those of the body, or of the upload that is asked for."""
+        if asked.upload is None:
+            async with self.uploads.receive(request) as files:
+                yield files
+        else:
+            refuse_body(request)
+            with self.kept.use(asked.upload) as files:
+                yield files
+
     async def _tidy(self) -> None:
-        """Give memory back when nothing has been shaded for a while."""
+        """Give memory back when nothing has been shaded for a while; forget old uploads."""
         tidied = time.monotonic()
         while True:
             await asyncio.sleep(self.settings.idle_trim / 2)
+            self.kept.tidy()
             ended = self.workers.last_end
             idle = time.monotonic() - ended
             if ended > tidied and not self.workers.taken and idle > self.settings.idle_trim:
@@ -146,7 +160,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def shade(
         effect: str, request: Request, asked: Annotated[ShadeParameters, Query()]
     ) -> Response:
-        """Send one EXR as the body, or one or several as the files of a form.
+        """Send one EXR as the body, or the files of a form, or name what is kept (`?upload=`).
 
         Takes any size from 1x1 up. Pixels that aren't finite are background. The answer's
         headers, and its EXR header, say how it was made. With `explain=1` the answer is the plan
@@ -184,6 +198,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
     routes.install(app, service.environments, service.uploads, service.settings)
     live_routes.install(app, service, service.sessions, service.tokens)
+    upload_routes.install(app, service)
+    pages.install(app)
 
     @app.get("/healthz", tags=["operation"], summary="Is the process alive?", responses=errors({}))
     async def healthz() -> dict[str, str]:
@@ -211,12 +227,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     async def metrics() -> Response:
         return PlainTextResponse(service.telemetry.render(), media_type=METRICS_TYPE)
-
-    page = files("deepshade_service").joinpath("index.html").read_text("utf-8")
-
-    @app.get("/", include_in_schema=False)
-    async def index() -> HTMLResponse:
-        return HTMLResponse(page)
 
     return app
 
@@ -247,6 +257,7 @@ def _effect(name: str, models: Models) -> dict[str, Any]:
             for i in effect.inputs
         ],
         "outputs": effect.outputs,
+        "light": effect.is_light,
         "reference": effect.reference,
         "background": effect.background,
         "settings": [_setting(s) for s in SETTINGS.values() if effect.takes(s)],
@@ -255,7 +266,10 @@ def _effect(name: str, models: Models) -> dict[str, Any]:
 
 
 def _setting(setting: Setting) -> dict[str, Any]:
-    """Without it, what an image's `header` says counts, else the `default`."""
+    """Without it, what an image's `header` says counts, else the `default`.
+
+    A length may be `learnt`: between which shares of a picture's median depth.
+    """
     return {
         "name": setting.name,
         "unit": setting.unit,
@@ -264,6 +278,7 @@ def _setting(setting: Setting) -> dict[str, Any]:
         "highest": setting.highest,
         "header": setting.header if setting.stored else None,
         "default": setting.default,
+        "learnt": setting.learnt if setting.share else None,
     }
 
 
@@ -339,6 +354,7 @@ _SHADE_RESPONSES: dict[int | str, Any] = {
 _SHADE_RESPONSES |= errors(
     {
         404: "Unknown effect, or no bundle for it",
+        410: "The upload is no longer kept",
         415: "Another content type than EXR or a form",
         422: "A missing attribute, a bad parameter, or a G-buffer that contradicts itself",
         500: "A bundle that can't be loaded, or a failure inside",

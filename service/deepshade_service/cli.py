@@ -58,6 +58,13 @@ def serve(
         str | None,
         typer.Option(help="For bodies that arrive or wait, in sum. Default: twice --max-body."),
     ] = None,
+    keep: Annotated[
+        str | None,
+        typer.Option(
+            help="For uploads that are kept to be shaded again, as 512M. Default: a quarter of"
+            " --max-uploads."
+        ),
+    ] = None,
     max_files: Annotated[int, typer.Option(min=1, help="Most files of a form.")] = 32,
     max_decoded: Annotated[str | None, typer.Option(help="Largest decoded file.")] = None,
     max_pixels: Annotated[int | None, typer.Option(min=1, help="Most pixels of a part.")] = None,
@@ -140,6 +147,7 @@ def serve(
         memory=parse_size(memory) if memory else default_memory(),
         uploads=uploads,
         files=max_files,
+        keep=parse_size(keep) if keep else 0,
         workers=workers,
         queue=queue,
         body_timeout=body_timeout,

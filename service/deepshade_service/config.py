@@ -46,6 +46,8 @@ class Settings:
     `memory` is what all requests together may use for pixels and networks, above the idle
     service; tiles are cut to fit. `uploads` bounds, besides, the bodies held while they arrive
     (twice their bytes) and wait; 0 is the default for this machine, or what the largest body needs.
+    `keep` bounds the uploads that are kept for `keep_seconds` after their last use, so that a
+    picture needn't be sent for each change of a setting; 0 is a quarter of `uploads`.
     `engine` and `precision` pin what requests run on that pin nothing themselves; None leaves it
     to the rule (`deepshade.engines.choose`). `environments` is a folder of environment maps, into
     which requests may add more if `environment_uploads`; those prepared may take a quarter of
@@ -70,6 +72,8 @@ class Settings:
     memory: int = field(default_factory=default_memory)
     uploads: int = 0
     files: int = 32
+    keep: int = 0
+    keep_seconds: float = 900.0
     body_timeout: float = 60.0
     idle_trim: float = 1.0
     grace: float = 20.0
@@ -86,7 +90,10 @@ class Settings:
         most = 2 * self.limits.body_bytes
         if self.uploads == 0:
             object.__setattr__(self, "uploads", max(default_uploads(), most))
-        for key in ("threads", "workers", "memory", "uploads", "files", "live_frame", "live_rate"):
+        if self.keep == 0:
+            object.__setattr__(self, "keep", self.uploads // 4)
+        counts = ("threads", "workers", "memory", "uploads", "files", "keep")
+        for key in (*counts, "live_frame", "live_rate"):
             _require(key, getattr(self, key) >= 1, "at least 1")
         _require(
             "uploads",
@@ -99,7 +106,7 @@ class Settings:
             "off, or there must be a folder for them (--environments)",
         )
         _require("queue", self.queue >= 0, "0 or more")
-        for key in ("body_timeout", "idle_trim", "grace"):
+        for key in ("body_timeout", "idle_trim", "grace", "keep_seconds"):
             _require(key, getattr(self, key) > 0, "more than 0 seconds")
 
 

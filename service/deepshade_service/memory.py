@@ -119,6 +119,18 @@ def need_of(
     return Need(held + max(decoded, tile * pixels), pixels)
 
 
+def bytes_to_read(header: exr.Header, channels: int, total: int) -> int:
+    """What it takes to read so many channels of a file and to write them into another.
+
+    Raises LimitError when that is more than the `total`.
+    """
+    pixels = 3 * 4 * channels * prod(size_of([header]))  # decoded, as stored, encoded
+    least = header.body_bytes + pixels + _decoding([header])
+    if least > total:
+        raise LimitError("memory_bytes", least, total)
+    return least
+
+
 def size_of(headers: Sequence[exr.Header]) -> tuple[int, int]:
     """(height, width) of the largest part: any may turn out to be the one that is shaded."""
     return max((part.shape for header in headers for part in header.parts), key=prod)

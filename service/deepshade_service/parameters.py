@@ -82,6 +82,13 @@ class ShadeParameters(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    upload: Annotated[
+        str | None,
+        Field(
+            description="In place of a body: the `name` of a kept upload (POST /uploads) or of a"
+            " sample (GET /samples)."
+        ),
+    ] = None
     radius: Annotated[
         float | None,
         _setting("radius", ", else 15%: a percentage is of the picture's median depth"),

@@ -28,6 +28,7 @@ _OPTIONS = {
     "channels": "--max-channels",
     "files": "--max-files",
     "memory_bytes": "--memory",
+    "kept_bytes": "--keep",
 }
 CLIENT_GONE = 499
 _SWITCHES = ("strict", "trust")  # which commands take without a value

@@ -43,6 +43,18 @@ class Upload:
         return source_name(self.field, self.filename)
 
 
+def refuse_body(request: Request) -> None:
+    """Raises Problem 422 for a request with a body, where an upload stands in its place."""
+    headers = request.headers
+    if headers.get("content-length", "0") != "0" or "transfer-encoding" in headers:
+        raise Problem(
+            422,
+            "bad-parameter",
+            "upload: the request has a body too",
+            fix="leave out ?upload= or the body",
+        )
+
+
 class Uploads:
     """Receives bodies and counts the bytes that are held, so that their sum stays bounded."""
 

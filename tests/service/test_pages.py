@@ -23,8 +23,36 @@ def test_a_page_loads_nothing_from_elsewhere(client, page):
     assert not re.findall(r"@import|https://", html)
 
 
-def test_the_page_names_no_command_line_option_but_curl_s(client):
-    assert re.findall(r"--[a-z-]+", client.get("/").text) == ["--fail-with-body", "--data-binary"]
+def test_the_pages_load_only_what_is_served_and_only_as_files_of_their_own(client):
+    seen, todo = set(), ["/", "/live/any"]
+    while todo:
+        url = todo.pop()
+        if url in seen:
+            continue
+        seen.add(url)
+        answer = client.get(url)
+        assert answer.status_code == 200, url
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'" in policy and "unsafe" not in policy
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        if url.endswith(".js"):
+            assert answer.headers["content-type"].startswith("text/javascript")
+        text = answer.text
+        assert not re.search(r"<script(?![^>]*src=)|<style|\bstyle=|\son\w+=", text), url
+        assert not re.search(r"innerHTML|outerHTML|insertAdjacent|document\.write|eval\(", text), (
+            url
+        )
+        found = re.findall(r"""(?:src|href)="((?:\.\./)?page/[^"]+)"|from '(\./[^']+)'""", text)
+        todo += [urljoin(url, next(filter(None, groups))) for groups in found]
+    assert len(seen) > 10
+
+
+def test_the_page_s_files_are_sent_once_and_named_plainly(client):
+    first = client.get("/page/style.css")
+    again = client.get("/page/style.css", headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    for name in ("..%2fapp.py", "nothing.js", "style.css%00", "%2e%2e%2fconfig.py"):
+        assert client.get(f"/page/{name}").status_code == 404, name
 
 
 def test_every_curl_fails_when_the_service_does():

@@ -7,6 +7,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -57,3 +58,12 @@ def test_what_the_page_says_serves_what_ships_to_the_bit(
     assert requirement.endswith(".whl[client]")
     pip = [sys.executable, "-m", "pip", "--python", str(tmp_path / "env"), "install", "-q"]
     subprocess.run([*pip, "--dry-run", requirement], check=True)
+
+
+def test_the_pages_are_in_the_wheel(wheel: Path) -> None:
+    """Nothing of them comes from the repository, or from the internet."""
+    folder = ROOT / "service" / "deepshade_service" / "page"
+    with zipfile.ZipFile(wheel) as archive:
+        for path in filter(Path.is_file, folder.rglob("*")):
+            name = path.relative_to(ROOT / "service").as_posix()
+            assert archive.read(name) == path.read_bytes()
