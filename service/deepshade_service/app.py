@@ -22,7 +22,8 @@ from deepshade.engines import Engine
 from deepshade.errors import EngineError
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
-from deepshade_service import composition, problems
+from deepshade.tokens import Guard
+from deepshade_service import bundle_routes, composition, problems
 from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
@@ -125,6 +126,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     problems.install(app, ShadeParameters.model_fields)
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
+    app.add_middleware(Guard, token=service.settings.token, guarded=bundle_routes.guarded)
 
     @app.post(
         "/shade/{effect}",
@@ -163,6 +165,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def one_effect(effect: str) -> dict[str, Any]:
         return _effect(find_effect(effect).name, service.models)
 
+    bundle_routes.install(app, service.models)
     routes.install(app, service.environments, service.uploads, service.settings)
 
     @app.get("/healthz", tags=["operation"], summary="Is the process alive?")

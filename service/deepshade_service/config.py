@@ -48,7 +48,8 @@ class Settings:
     `engine` and `precision` pin what requests run on that pin nothing themselves; None leaves it
     to the rule (`deepshade.engines.choose`). `environments` is a folder of environment maps, into
     which requests may add more if `environment_uploads`; those prepared may take a quarter of
-    `memory` besides.
+    `memory` besides. `token` is what whoever changes which bundles answer must send; without one
+    only this machine may (`deepshade.tokens`).
     """
 
     models: Path | Sequence[Path] = field(default_factory=bundle_roots)
@@ -66,6 +67,7 @@ class Settings:
     body_timeout: float = 60.0
     idle_trim: float = 1.0
     grace: float = 20.0
+    token: str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         most = 2 * self.limits.body_bytes

@@ -1,0 +1,110 @@
+"""The routes of bundles: which version answers, look again, pin one, go back to the one before."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Query
+
+from deepshade import versions
+from deepshade.effects import EFFECTS
+from deepshade_service.models import Models, not_ready
+from deepshade_service.problems import Problem
+
+Number = Annotated[int | None, Query(ge=1, description="Without it: the one before.")]
+
+
+def guarded(method: str, path: str) -> bool:
+    """Whether a request changes what is served, which not everybody may."""
+    return path.startswith("/bundles") and method not in ("GET", "HEAD")
+
+
+def install(app: FastAPI, models: Models) -> None:
+    """Add the routes to `app`."""
+
+    @app.get("/bundles", tags=["bundles"], summary="All bundles, with their versions")
+    async def listed() -> list[dict[str, Any]]:
+        """`number` is the version that answers, where a bundle has versions."""
+        return [describe(models, bundle) for e in EFFECTS for bundle in models.bundles(e)]
+
+    @app.post("/bundles/reload", tags=["bundles"], summary="Look at the folders again")
+    async def reload() -> dict[str, Any]:
+        """What changed is loaded and tried out before it answers. Whatever can't be loaded is
+        refused with a 409, and what answered before goes on."""
+        if not models.ready:
+            raise not_ready(models)
+        changed, refused = await models.reload()
+        if refused:
+            raise Problem(
+                409,
+                "bad-bundle",
+                "; ".join(f"{label}: {why}" for label, why in refused.items()),
+                fix="what answered before goes on; the service's log says more",
+                changed=changed,
+                refused=sorted(refused),
+            )
+        return {"changed": changed}
+
+    @app.post("/bundles/{effect}/{name}/pin", tags=["bundles"], summary="Stay at one version")
+    async def pin(
+        effect: str, name: str, version: Annotated[int, Query(ge=1)]
+    ) -> dict[str, Any]:
+        """It is loaded and tried out first. Nothing that is published moves the alias then."""
+        alias = models.alias(effect, name)
+        await _point(models, alias, version)
+        await asyncio.to_thread(alias.pin, version)
+        return described(models, effect, name)
+
+    @app.delete("/bundles/{effect}/{name}/pin", tags=["bundles"], summary="Follow again")
+    async def unpin(effect: str, name: str) -> dict[str, Any]:
+        """What is published next moves the alias again; until then it stays."""
+        alias = models.alias(effect, name)
+        await asyncio.to_thread(alias.pin, None)
+        return described(models, effect, name)
+
+    @app.post("/bundles/{effect}/{name}/rollback", tags=["bundles"], summary="Go back by one")
+    async def rollback(effect: str, name: str) -> dict[str, Any]:
+        """To the version before the one that answers, loaded and tried out first. A pin is lost."""
+        alias = models.alias(effect, name)
+        await _point(models, alias, alias.before())
+        await asyncio.to_thread(alias.pin, None)
+        return described(models, effect, name)
+
+
+def described(models: Models, effect: str, name: str) -> dict[str, Any]:
+    """One bundle, as `GET /bundles` has it."""
+    (bundle,) = models.find(effect, name)
+    return describe(models, bundle)
+
+
+def describe(models: Models, bundle: Any) -> dict[str, Any]:
+    """A bundle and its versions as JSON values."""
+    found = {
+        "effect": bundle.effect,
+        "name": bundle.name,
+        "sha256": bundle.sha256,
+        "dssim": bundle.dssim,
+        "number": None,
+        "versions": [],
+        "pinned": None,
+    }
+    if bundle.path.parents[1].name != versions.FOLDER:
+        return found
+    alias = versions.Alias(bundle.path.parents[3], bundle.effect, bundle.name)
+    more = {"number": int(bundle.path.name), "versions": alias.numbers(), "pinned": alias.pinned}
+    return found | more
+
+
+async def _point(models: Models, alias: versions.Alias, number: int) -> None:
+    if not models.ready:
+        raise not_ready(models)
+    try:
+        await models.point(alias, number)
+    except OSError as error:
+        raise Problem(
+            409,
+            "read-only",
+            f"{alias.link} can't be moved: {error.strerror}",
+            fix="ask the trainer service to do it: 'deepshade-client pin' and 'rollback'",
+        ) from error
