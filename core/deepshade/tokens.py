@@ -63,9 +63,7 @@ class Guard:
     `guarded` is asked with a method and a path.
     """
 
-    def __init__(
-        self, app: App, token: str | None, guarded: Callable[[str, str], bool]
-    ) -> None:
+    def __init__(self, app: App, token: str | None, guarded: Callable[[str, str], bool]) -> None:
         self._app, self._token, self._guarded = app, token, guarded
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import secrets
 import shutil
 from dataclasses import dataclass
@@ -152,7 +151,7 @@ class Alias:
         temporary = self.link.with_name(f".{self.name}.{secrets.token_hex(4)}.tmp")
         temporary.symlink_to(Path(FOLDER, self.name, str(number)))
         try:
-            os.replace(temporary, self.link)
+            temporary.replace(self.link)
         finally:
             temporary.unlink(missing_ok=True)
         sync_folder(self.link.parent)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query
 
 from deepshade import versions
 from deepshade.effects import EFFECTS
+from deepshade.errors import BundleError
 from deepshade_service.models import Models, not_ready
 from deepshade_service.problems import Problem
-
-Number = Annotated[int | None, Query(ge=1, description="Without it: the one before.")]
 
 
 def guarded(method: str, path: str) -> bool:
@@ -47,12 +47,10 @@ def install(app: FastAPI, models: Models) -> None:
         return {"changed": changed}
 
     @app.post("/bundles/{effect}/{name}/pin", tags=["bundles"], summary="Stay at one version")
-    async def pin(
-        effect: str, name: str, version: Annotated[int, Query(ge=1)]
-    ) -> dict[str, Any]:
+    async def pin(effect: str, name: str, version: Annotated[int, Query(ge=1)]) -> dict[str, Any]:
         """It is loaded and tried out first. Nothing that is published moves the alias then."""
         alias = models.alias(effect, name)
-        await _point(models, alias, version)
+        await _point(models, alias, lambda: alias.version(version).number)
         await asyncio.to_thread(alias.pin, version)
         return described(models, effect, name)
 
@@ -67,7 +65,7 @@ def install(app: FastAPI, models: Models) -> None:
     async def rollback(effect: str, name: str) -> dict[str, Any]:
         """To the version before the one that answers, loaded and tried out first. A pin is lost."""
         alias = models.alias(effect, name)
-        await _point(models, alias, alias.before())
+        await _point(models, alias, alias.before)
         await asyncio.to_thread(alias.pin, None)
         return described(models, effect, name)
 
@@ -96,9 +94,13 @@ def describe(models: Models, bundle: Any) -> dict[str, Any]:
     return found | more
 
 
-async def _point(models: Models, alias: versions.Alias, number: int) -> None:
+async def _point(models: Models, alias: versions.Alias, chosen: Callable[[], int]) -> None:
     if not models.ready:
         raise not_ready(models)
+    try:
+        number = chosen()
+    except BundleError as error:
+        raise Problem(422, "no-version", str(error), fix=error.fix) from error
     try:
         await models.point(alias, number)
     except OSError as error:

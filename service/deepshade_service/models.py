@@ -74,7 +74,9 @@ class Models:
         async with self._changing:
             found, refused = await self._verified()
             changed, reasons = [], dict.fromkeys(refused, "its files are damaged")
-            for label in self._labels() - {_label(b) for each in found.values() for b in each.values()}:
+            for label in self._labels() - {
+                _label(b) for each in found.values() for b in each.values()
+            }:
                 if label not in reasons:
                     effect, _, name = label.partition("/")
                     del self._bundles[effect][name]
@@ -133,15 +135,21 @@ class Models:
         """
         backend = self.backend(bundle)
         engine = await self.engine(bundle, backend)
-        sizes = [size for key, each in self._engines.items() for size in each.sizes()
-                 if old is not None and key[:2] == _key(old)]
+        sizes = [
+            size
+            for key, each in self._engines.items()
+            for size in each.sizes()
+            if old is not None and key[:2] == _key(old)
+        ]
         try:
             await asyncio.to_thread(_probe, engine, sizes)
         except Exception as error:
             self._engines.pop((*_key(bundle), backend), None)
             log.exception("bundle %s fails its probe on %s", _label(bundle), backend)
             raise Problem(
-                500, "bad-bundle", f"the bundle '{_label(bundle)}' fails its probe on {backend}: {error}"
+                500,
+                "bad-bundle",
+                f"the bundle '{_label(bundle)}' fails its probe on {backend}: {error}",
             ) from error
 
     def _take(self, bundle: Bundle, old: Bundle | None) -> None:
@@ -191,7 +199,7 @@ class Models:
                 404,
                 "no-bundle",
                 f"no bundle for the effect '{effect}' is installed here",
-                fix=f"put one into the service's models folder as {effect}/<name>/, then POST /bundles/reload",
+                fix=f"put one into the service's models folder as {effect}/<name>/, and restart",
                 installed=sorted(self._bundles),
             )
         if name is not None and name not in names:

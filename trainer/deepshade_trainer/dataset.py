@@ -167,8 +167,8 @@ class Dataset:
     def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, ...]:
         """G-buffers (N, C, H, W) and references (N, outputs, H, W) to learn from.
 
-        Each sample is turned by one of the effect's symmetries (`turn`); some have 16-bit lengths, some
-        directions that are too short; networks run per channel see one colour channel.
+        Each sample is turned by one of the effect's symmetries (`turn`); some have 16-bit lengths,
+        some directions that are too short; networks run per channel see one colour channel.
         """
         drawn = [self._drawn(number, rng) for number in numbers]
         return tuple(torch.from_numpy(np.stack(each)) for each in zip(*drawn, strict=True))

@@ -20,7 +20,7 @@ Tensors = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Run:
-    """A run's folder: `recipe.json`, `checkpoint.safetensors`, `metrics.json`, `preview.png`, `log/`."""
+    """A run's folder: recipe, checkpoint, metrics, a preview, and TensorBoard's `log/`."""
 
     folder: Path
 

@@ -117,7 +117,9 @@ class DataSpec:
         """The symmetries in which a view is stored: those that all effects have."""
         if not self.augment:
             return (0,)
-        return tuple(t for t in symmetry.ALL if all(t in EFFECTS[e].symmetries for e in self.effects))
+        return tuple(
+            t for t in symmetry.ALL if all(t in EFFECTS[e].symmetries for e in self.effects)
+        )
 
     @property
     def least_contrast(self) -> float:

@@ -49,7 +49,9 @@ class Settings:
             raise ConfigError("at_a_time", detail="at least one job at a time, of one thread")
         for service in self.services:
             if not service.startswith(("http://", "https://")):
-                raise ConfigError("service", detail=f"{service!r} is no address like http://host:8000")
+                raise ConfigError(
+                    "service", detail=f"{service!r} is no address like http://host:8000"
+                )
         for each in (self.folder, self.published):
             each.mkdir(parents=True, exist_ok=True)
 

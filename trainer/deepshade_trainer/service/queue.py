@@ -139,9 +139,7 @@ class Queue:
                 event = {"error": f"its process ended with {code}", "fix": "ask for it again"}
             state, values = FAILED, {"sentence": event["error"], "fix": event["fix"]}
         log.info("job %s is %s %s", job.id, state, values.get("sentence", ""))
-        await self._patiently(
-            lambda: self._store.move(job.id, state, of=(RUNNING,), **values)
-        )
+        await self._patiently(lambda: self._store.move(job.id, state, of=(RUNNING,), **values))
         del self._running[job.id]
         self.wake()
 

@@ -99,10 +99,7 @@ def job_of(
         threads=settings.threads,
         **{key: getattr(asked, key) for key in RANGES if key != "threads"},
     )
-    if rendering is None:
-        key = plan.key()
-    else:
-        key = plan.key(rendering.key)
+    key = plan.key() if rendering is None else plan.key(rendering.key)
     now = time.time()
     job = Job(
         id=key[:16],
@@ -121,7 +118,7 @@ def job_of(
 
 
 def find_base(effect: str, name: str, settings: Settings) -> Path:
-    """The real folder of the bundle to begin with: a version stays what it is. Raises BundleError."""
+    """The real folder of the bundle to begin with: versions stay. Raises BundleError."""
     check_name(name)
     for root in settings.roots:
         if (root / effect / name / CONFIG).is_file():

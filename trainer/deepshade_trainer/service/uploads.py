@@ -37,7 +37,9 @@ class Uploads:
         manifest = Manifest.read(path)
         missing = [shard.file for shard in manifest.shards if not (path / shard.file).is_file()]
         if missing:
-            raise DataError(f"the upload {name!r} lacks {', '.join(missing[:5])}", fix="send it too")
+            raise DataError(
+                f"the upload {name!r} lacks {', '.join(missing[:5])}", fix="send it too"
+            )
         return path.resolve()
 
     def describe(self, name: str) -> dict[str, Any]:
@@ -63,8 +65,8 @@ class Uploads:
         if not _FILE.fullmatch(file):
             raise ConfigError(
                 "file",
-                detail=f"a data set has no file {file[:100]!r}, only {NAME}, shard-00000.safetensors "
-                "and environments/<sha256>.exr",
+                detail=f"a data set has no file {file[:100]!r}, only {NAME}, "
+                "shard-00000.safetensors and environments/<sha256>.exr",
             )
         path = self._root / name / file
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,14 +75,13 @@ class Uploads:
         used = await asyncio.to_thread(self._used)
         size = 0
         try:
-            with replacing(path) as temporary:
-                with temporary.open("wb") as out:
-                    async for chunk in chunks:
-                        size += len(chunk)
-                        self._held += len(chunk)
-                        if used + self._held > self._limit:
-                            raise LimitError("upload_bytes", used + self._held, self._limit)
-                        await asyncio.to_thread(out.write, chunk)
+            with replacing(path) as temporary, temporary.open("wb") as out:
+                async for chunk in chunks:
+                    size += len(chunk)
+                    self._held += len(chunk)
+                    if used + self._held > self._limit:
+                        raise LimitError("upload_bytes", used + self._held, self._limit)
+                    await asyncio.to_thread(out.write, chunk)
         finally:
             self._held -= size
         return {"name": name, "file": file, "bytes": size}

@@ -8,5 +8,5 @@ from deepshade_trainer.tuning.plan import Plan
 
 
 def candidate(folder: Path, plan: Plan) -> Path:
-    """The bundle of the job in a folder, published or not; its decision lies in it, written last."""
+    """The bundle of the job in a folder, published or not; its decision is written last."""
     return folder / "candidate" / plan.effect / plan.name

@@ -76,7 +76,10 @@ class Rendering:
 def _contents(path: Path) -> Any:
     try:
         beside = sorted(p for p in path.parent.rglob("*") if p.is_file())[:10000]
-        known = [(str(p.relative_to(path.parent)), p.stat().st_size, p.stat().st_mtime_ns) for p in beside]
+        known = [
+            (str(p.relative_to(path.parent)), p.stat().st_size, p.stat().st_mtime_ns)
+            for p in beside
+        ]
         return [sha256_of(path), known]
     except OSError as error:
         raise DataError(f"can't read {path}: {error.strerror}") from error

@@ -1,5 +1,4 @@
-"""The shipped samples as data sets, one each: what must not get worse where nothing else is given.
-"""
+"""The shipped samples as data sets: what must not get worse where nothing else is given."""
 
 from __future__ import annotations
 
