@@ -20,9 +20,10 @@ from typing import Any, ClassVar
 
 import httpx
 import pytest
-from starlette.testclient import TestClient
+import uvicorn
 
 from deepshade.errors import BundleError, ConfigError
+from deepshade.serving import listen
 from deepshade.versions import Alias
 from deepshade_trainer.service.app import create_app
 from deepshade_trainer.service.config import Settings
@@ -223,7 +224,9 @@ def test_paths_stay_in_their_roots(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def settings(base: Path, data: Path, judges: Path, tmp_path: Path) -> Settings:
+def settings(
+    base: Path, data: Path, judges: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> Settings:
     library = tmp_path / "library"
     (library / "ao").mkdir(parents=True)
     shutil.copytree(judges, library / "ao/test")
@@ -235,26 +238,39 @@ def settings(base: Path, data: Path, judges: Path, tmp_path: Path) -> Settings:
         library=library,
         token=TOKEN,
         threads=1,
+        **getattr(request, "param", {}),
     )
 
 
 @pytest.fixture
-def client(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
-    """A service whose queue stands still."""
+def client(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> Iterator[httpx.Client]:
+    """A client of a service, in a thread, whose queue stands still."""
 
     async def still(self: Any) -> None:
         self._store.prepare()
 
     monkeypatch.setattr("deepshade_trainer.service.queue.Queue.run", still)
+    config = uvicorn.Config(create_app(settings), log_config=None, timeout_graceful_shutdown=1)
+    server, listener = uvicorn.Server(config), listen("127.0.0.1", 0)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     headers = {"Authorization": f"Bearer {TOKEN}"}
-    with TestClient(create_app(settings), headers=headers) as client:
+    with httpx.Client(base_url=url, headers=headers, trust_env=False, timeout=60) as client:
+        until = time.monotonic() + 30
+        while client.get("/readyz").status_code != 200:
+            assert time.monotonic() < until
+            time.sleep(0.01)
         yield client
+    server.should_exit = True
+    thread.join(30)
+    listener.close()
 
 
 ASKED = {"data": "waves", "steps": 4, "batch": 4}
 
 
-def test_the_same_request_finds_the_same_job(client: TestClient) -> None:
+def test_the_same_request_finds_the_same_job(client: httpx.Client) -> None:
     first = client.post("/train/ao", json=ASKED)
     assert first.status_code == 202
     assert (first.json()["state"], first.json()["before"]) == ("queued", 0)
@@ -288,7 +304,7 @@ def test_the_same_request_finds_the_same_job(client: TestClient) -> None:
     ],
 )
 def test_what_cant_be_is_said_at_once(
-    client: TestClient, effect: str, asked: dict[str, Any], said: str
+    client: httpx.Client, effect: str, asked: dict[str, Any], said: str
 ) -> None:
     answer = client.post(f"/train/{effect}", json=asked)
     assert answer.status_code == 422, answer.text
@@ -296,7 +312,7 @@ def test_what_cant_be_is_said_at_once(
     assert client.get("/jobs").json() == []
 
 
-def test_a_token_is_needed_for_everything_but_health(client: TestClient) -> None:
+def test_a_token_is_needed_for_everything_but_health(client: httpx.Client) -> None:
     bare = {"Authorization": ""}
     assert client.get("/healthz", headers=bare).status_code == 200
     for path in ("/jobs", "/bundles", "/docs", "/readyz", "/jobs/x/events"):
@@ -304,7 +320,7 @@ def test_a_token_is_needed_for_everything_but_health(client: TestClient) -> None
     assert client.post("/train/ao", json=ASKED, headers=bare).status_code == 401
 
 
-def test_uploads_are_data_sets_and_nothing_else(client: TestClient, data: Path) -> None:
+def test_uploads_are_data_sets_and_nothing_else(client: httpx.Client, data: Path) -> None:
     for path in sorted(data.iterdir(), reverse=True):  # the manifest last
         answer = client.put(f"/data/mine/{path.name}", content=path.read_bytes())
         assert answer.status_code == 200, answer.text
@@ -318,14 +334,14 @@ def test_uploads_are_data_sets_and_nothing_else(client: TestClient, data: Path) 
     assert client.get("/data/mine").json()["files"] == []
 
 
-def test_uploads_have_a_limit(client: TestClient) -> None:
-    client.app.state.trainer.uploads._limit = 1000  # type: ignore[attr-defined]
+@pytest.mark.parametrize("settings", [{"upload_bytes": 1000}], indirect=True)
+def test_uploads_have_a_limit(client: httpx.Client) -> None:
     assert client.put("/data/a/manifest.json", content=bytes(600)).status_code == 200
     assert client.put("/data/b/manifest.json", content=bytes(600)).status_code == 413
     assert client.get("/data/b").json()["files"] == []
 
 
-def test_one_service_has_a_folder(client: TestClient, settings: Settings) -> None:
+def test_one_service_has_a_folder(client: httpx.Client, settings: Settings) -> None:
     with pytest.raises(ConfigError, match="another trainer service uses"):
         create_app(settings)
 
@@ -463,7 +479,9 @@ def test_a_job_from_request_to_version_through_a_killed_service(
         assert service.wait(60) == 0
 
 
-def test_a_rendered_scene_is_known_by_its_contents(client: TestClient, settings: Settings) -> None:
+def test_a_rendered_scene_is_known_by_its_contents(
+    client: httpx.Client, settings: Settings
+) -> None:
     asked = {"scene": "procedural:room:1", "views": 8, "steps": 4}
     first = client.post("/train/ao", json=asked).json()
     assert first["id"] == client.post("/train/ao", json=asked).json()["id"]

@@ -27,6 +27,7 @@ from deepshade_trainer.tuning.events import last_event, read_events
 
 POLL = 0.25  # seconds between looks at a job's events
 OPEN = ("/healthz",)
+MAX_BODY = 1 << 16  # bytes of a request for a job
 
 
 class Trainer:
@@ -80,6 +81,16 @@ class Trainer:
         return found
 
 
+def _found(job: str, request: Request) -> Job:
+    known: Job | None = request.app.state.trainer.store.get(job[:16])
+    if known is None or job != known.id:
+        raise Problem(404, "no-job", f"there is no job {job[:40]!r}", "GET /jobs lists them")
+    return known
+
+
+Found = Annotated[Job, Depends(_found)]
+
+
 def create_app(settings: Settings) -> FastAPI:
     """The ASGI application for these settings. Raises ConfigError where its folder is in use."""
     trainer = Trainer(settings)
@@ -94,15 +105,13 @@ def create_app(settings: Settings) -> FastAPI:
     problems.install(app)
     app.add_middleware(Guard, token=settings.token, guarded=lambda _, path: path not in OPEN)
 
-    def found(job: str) -> Job:
-        known = trainer.store.get(job[:16])
-        if known is None or job != known.id:
-            raise Problem(404, "no-job", f"there is no job {job[:40]!r}", "GET /jobs lists them")
-        return known
-
-    Found = Annotated[Job, Depends(found)]
-
-    @app.post("/train/{effect}", tags=["jobs"], summary="Fine-tune a shader", status_code=202)
+    @app.post(
+        "/train/{effect}",
+        tags=["jobs"],
+        summary="Fine-tune a shader",
+        status_code=202,
+        max_body_size=MAX_BODY,
+    )
     def train(effect: str, asked: TrainRequest, response: Response) -> dict[str, Any]:
         """The same data, code, settings and seed are the same job: it is found (200), not done
         again. One that failed or was cancelled goes on."""
