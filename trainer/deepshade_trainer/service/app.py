@@ -12,6 +12,7 @@ from typing import Annotated, Any
 from fastapi import Depends, FastAPI, Header, Query, Request, Response
 from fastapi.responses import FileResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
+from fastapi_offline import FastAPIOffline
 
 from deepshade.tokens import Guard
 from deepshade_trainer.run import Run
@@ -94,7 +95,7 @@ Found = Annotated[Job, Depends(_found)]
 def create_app(settings: Settings) -> FastAPI:
     """The ASGI application for these settings. Raises ConfigError where its folder is in use."""
     trainer = Trainer(settings)
-    app = FastAPI(
+    app = FastAPIOffline(  # FastAPI, but /docs needs no internet
         redoc_url=None,
         title="deepshade trainer",
         version=version("deepshade"),
