@@ -8,6 +8,7 @@ from __future__ import annotations
 import hmac
 import json
 import os
+import re
 from collections.abc import Awaitable, Callable, MutableMapping
 from hashlib import sha256
 from ipaddress import ip_address
@@ -18,7 +19,7 @@ from deepshade.errors import ConfigError
 from deepshade.problems import MEDIA_TYPE, type_uri
 
 VARIABLE = "DEEPSHADE_TOKEN"
-SHORTEST = 16  # characters
+_TOKEN = re.compile(r"[\w.~-]{16,256}", re.ASCII)
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -27,13 +28,13 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 def configured() -> str | None:
-    """The token of $DEEPSHADE_TOKEN; None without. Raises ConfigError for one that is short."""
+    """The token of $DEEPSHADE_TOKEN; None without. Raises ConfigError for one that is none."""
     token = os.environ.get(VARIABLE) or None
-    if token is not None and (len(token) < SHORTEST or not token.isascii() or " " in token):
+    if token is not None and not _TOKEN.fullmatch(token):
         raise ConfigError(
             VARIABLE,
-            detail=f"${VARIABLE} must be at least {SHORTEST} ASCII characters without spaces; "
-            "'openssl rand -hex 32' makes one",
+            detail=f"${VARIABLE} must be 16 to 256 letters, digits or - . _ ~, as of "
+            "'openssl rand -hex 32'",
         )
     return token
 
@@ -55,7 +56,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class Guard:
+class TokenGuard:
     """ASGI middleware. With a token, whoever lacks it gets a 401 from what is `guarded`.
 
     Without one, requests must be made to a loopback name, or they get a 403: a web page that makes

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from deepshade.errors import ConfigError
-from deepshade.tokens import Guard, configured, is_loopback, same
+from deepshade.tokens import TokenGuard, configured, is_loopback, same
 
 TOKEN = "a-token-of-some-length"
 
@@ -28,7 +28,7 @@ def status(token: str | None, method: str = "POST", path: str = "/jobs", **heade
 
     pairs = [(name.encode(), value.encode()) for name, value in headers.items()]
     scope = {"type": "http", "method": method, "path": path, "headers": pairs}
-    guard = Guard(app, token, lambda method, path: path != "/healthz")
+    guard = TokenGuard(app, token, lambda method, path: path != "/healthz")
     asyncio.run(guard(scope, receive, send))
     return int(sent[0]["status"])
 

@@ -29,7 +29,9 @@ from deepshade_trainer import card
 from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.evaluation import evaluate
 from deepshade_trainer.export import export
+from deepshade_trainer.lit import Lit
 from deepshade_trainer.networks import Shader, build, bundle_weights
+from deepshade_trainer.networks.openings import Openings
 from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run, Tensors
 from deepshade_trainer.training import Every, Progress, train
@@ -189,7 +191,15 @@ def _blend(plan: Plan, recipe: Recipe, run: Run, parts: Parts, folder: Path) -> 
     tuned = run.load()[0]["average"]
     start = {**tuned, **bundle_weights(Bundle.load(Path(plan.base)))}
     start = {name: start[name] for name in tuned}
-    if parts.reminders:
+    data: Dataset
+    if isinstance(build(recipe.network), Openings):  # which is judged by what is open, as it learns
+        if not parts.reminders:
+            raise DataError(
+                f"fine-tuning {plan.effect} needs older views to rehearse",
+                fix="give the trainer a library with rehearsal views: see docs/trainer.md",
+            )
+        data, numbers = Lit(_folders(plan), plan.effect), parts.reminders
+    elif parts.reminders:
         data, numbers = _data(plan), parts.reminders
     else:
         folders = [path for group in _tests(plan, folder).values() for path in group]
