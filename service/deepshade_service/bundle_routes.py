@@ -9,8 +9,10 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query
 
 from deepshade import versions
+from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade.errors import BundleError
+from deepshade_service.changes import Changes
 from deepshade_service.models import Models, not_ready
 from deepshade_service.problems import Problem
 
@@ -22,19 +24,23 @@ def guarded(method: str, path: str) -> bool:
 
 def install(app: FastAPI, models: Models) -> None:
     """Add the routes to `app`."""
+    changes = Changes(models)
+
+    def ready() -> None:
+        if not models.loaded:
+            raise not_ready(models)
 
     @app.get("/bundles", tags=["bundles"], summary="All bundles, with their versions")
     async def listed() -> list[dict[str, Any]]:
         """`number` is the version that answers, where a bundle has versions."""
-        return [describe(models, bundle) for e in EFFECTS for bundle in models.bundles(e)]
+        return [describe(bundle) for e in EFFECTS for bundle in models.bundles(e)]
 
     @app.post("/bundles/reload", tags=["bundles"], summary="Look at the folders again")
     async def reload() -> dict[str, Any]:
         """What changed is loaded and tried out before it answers. Whatever can't be loaded is
         refused with a 409, and what answered before goes on."""
-        if not models.ready:
-            raise not_ready(models)
-        changed, refused = await models.reload()
+        ready()
+        changed, refused = await changes.reload()
         if refused:
             raise Problem(
                 409,
@@ -49,23 +55,25 @@ def install(app: FastAPI, models: Models) -> None:
     @app.post("/bundles/{effect}/{name}/pin", tags=["bundles"], summary="Stay at one version")
     async def pin(effect: str, name: str, version: Annotated[int, Query(ge=1)]) -> dict[str, Any]:
         """It is loaded and tried out first. Nothing that is published moves the alias then."""
-        alias = models.alias(effect, name)
-        await _point(models, alias, lambda: alias.version(version).number)
+        ready()
+        alias = changes.alias(effect, name)
+        await _point(changes, alias, lambda: alias.version(version).number)
         await asyncio.to_thread(alias.pin, version)
         return described(models, effect, name)
 
     @app.delete("/bundles/{effect}/{name}/pin", tags=["bundles"], summary="Follow again")
     async def unpin(effect: str, name: str) -> dict[str, Any]:
         """What is published next moves the alias again; until then it stays."""
-        alias = models.alias(effect, name)
+        alias = changes.alias(effect, name)
         await asyncio.to_thread(alias.pin, None)
         return described(models, effect, name)
 
     @app.post("/bundles/{effect}/{name}/rollback", tags=["bundles"], summary="Go back by one")
     async def rollback(effect: str, name: str) -> dict[str, Any]:
         """To the version before the one that answers, loaded and tried out first. A pin is lost."""
-        alias = models.alias(effect, name)
-        await _point(models, alias, alias.before)
+        ready()
+        alias = changes.alias(effect, name)
+        await _point(changes, alias, alias.before)
         await asyncio.to_thread(alias.pin, None)
         return described(models, effect, name)
 
@@ -73,10 +81,10 @@ def install(app: FastAPI, models: Models) -> None:
 def described(models: Models, effect: str, name: str) -> dict[str, Any]:
     """One bundle, as `GET /bundles` has it."""
     (bundle,) = models.find(effect, name)
-    return describe(models, bundle)
+    return describe(bundle)
 
 
-def describe(models: Models, bundle: Any) -> dict[str, Any]:
+def describe(bundle: Bundle) -> dict[str, Any]:
     """A bundle and its versions as JSON values."""
     found = {
         "effect": bundle.effect,
@@ -94,15 +102,13 @@ def describe(models: Models, bundle: Any) -> dict[str, Any]:
     return found | more
 
 
-async def _point(models: Models, alias: versions.Alias, chosen: Callable[[], int]) -> None:
-    if not models.ready:
-        raise not_ready(models)
+async def _point(changes: Changes, alias: versions.Alias, chosen: Callable[[], int]) -> None:
     try:
         number = chosen()
     except BundleError as error:
         raise Problem(422, "no-version", str(error), fix=error.fix) from error
     try:
-        await models.point(alias, number)
+        await changes.point(alias, number)
     except OSError as error:
         raise Problem(
             409,

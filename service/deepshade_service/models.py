@@ -8,14 +8,10 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from deepshade import versions
-from deepshade.bench import noise
-from deepshade.bundles import CONFIG, Bundle, bundle_folders
+from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS, Effect
 from deepshade.engines import Backend, Engine, available, choose, load_engine
-from deepshade.environments import black
 from deepshade.errors import DeepshadeError, EngineError, nearest
 from deepshade_service.problems import Problem
 
@@ -23,8 +19,7 @@ log = logging.getLogger("deepshade.service")
 
 MAX_ENGINES = 12  # in memory, one for each effect and a few; the one used longest ago goes
 
-PROBE = 64  # side of the picture that a bundle is tried out with
-
+Bundles = dict[str, dict[str, Bundle]]  # by effect and name
 Key = tuple[Path, str, Backend]  # a bundle's real folder and hash, and what it runs on
 
 
@@ -44,140 +39,72 @@ class Models:
     ) -> None:
         self.roots = (roots,) if isinstance(roots, Path) else tuple(roots)
         self.ready = False
+        self.loaded = False  # whether all were looked at, if only to find none
         self.refused: list[str] = []
         self._threads = threads
         self._pinned = pinned
-        self._bundles: dict[str, dict[str, Bundle]] = {}
+        self._bundles: Bundles = {}
         self._engines: OrderedDict[Key, Engine] = OrderedDict()
         self._loading: dict[Key, asyncio.Task[Engine]] = {}
         self._speeds: dict[Key, float] = {}
-        self._changing = asyncio.Lock()
 
     async def load(self) -> None:
         """Verify every bundle; what can't be used is left out, loudly. Loads no engine."""
         if not await asyncio.to_thread(available):
             log.error("the service stays unready: no engine is installed")
             return
-        async with self._changing:
-            self._bundles, self.refused = await self._verified()
-        self.ready = bool(self._bundles)
+        self._bundles, self.refused = await self.verified()
+        self.ready, self.loaded = bool(self._bundles), True
         if not self.ready:
             places = ", ".join(map(str, self.roots))
             log.error("no usable bundle under %s: the service stays unready", places)
 
-    async def reload(self) -> tuple[list[str], dict[str, str]]:
-        """Look at the folders again: which bundles changed, and which were refused and why.
+    def every(self) -> list[Bundle]:
+        """All bundles that answer."""
+        return _all(self._bundles)
 
-        What changed is loaded and tried out before it answers; until then, and where that fails,
-        what answered before goes on. Requests in flight end with what they began with.
-        """
-        async with self._changing:
-            found, refused = await self._verified()
-            changed, reasons = [], dict.fromkeys(refused, "its files are damaged")
-            for label in self._labels() - {
-                _label(b) for each in found.values() for b in each.values()
-            }:
-                if label not in reasons:
-                    effect, _, name = label.partition("/")
-                    del self._bundles[effect][name]
-                    changed.append(label)
-            for bundle in (b for each in found.values() for b in each.values()):
-                old = self._bundles.get(bundle.effect, {}).get(bundle.name)
-                if old is not None and _key(old) == _key(bundle):
-                    continue
-                try:
-                    await self._try_out(bundle, old)
-                except (DeepshadeError, Problem) as error:
-                    reasons[_label(bundle)] = str(error)
-                    continue
-                self._take(bundle, old)
-                changed.append(_label(bundle))
-            self.refused = sorted(reasons)
-            self.ready = self.ready or bool(self._bundles)
-            return changed, reasons
-
-    async def point(self, alias: versions.Alias, number: int) -> Bundle:
-        """Let an alias lead to that version once it is loaded and tried out, and answer with it.
-
-        Raises BundleError, Problem 500 and OSError; the alias and what answers are then as before.
-        """
-        async with self._changing:
-            bundle = await asyncio.to_thread(versions.load, alias.version(number).path)
-            old = self._bundles.get(bundle.effect, {}).get(bundle.name)
-            await self._try_out(bundle, old)
-            await asyncio.to_thread(alias.point, number)
-            self._take(bundle, old)
-            return bundle
-
-    def alias(self, effect: str, name: str) -> versions.Alias:
-        """The alias that this service answers with. Raises Problem 404 where there is none."""
-        find_effect(effect)
-        for root in self.roots:
-            if (root / effect / name / CONFIG).is_file():
-                alias = versions.Alias(root, effect, name)
-                if alias.current is not None:
-                    return alias
-                break
-        raise Problem(
-            404,
-            "no-version",
-            f"'{effect}/{name[:100]}' has no versions here",
-            fix="GET /bundles says which have; a fine-tuned one has them once it is published",
-        )
-
-    def _labels(self) -> set[str]:
-        return {_label(bundle) for each in self._bundles.values() for bundle in each.values()}
-
-    async def _try_out(self, bundle: Bundle, old: Bundle | None) -> None:
-        """Load a bundle where it will run, let it shade, and compile what `old` has compiled.
-
-        Raises EngineError and Problem 500.
-        """
-        backend = self.backend(bundle)
-        engine = await self.engine(bundle, backend)
-        sizes = [
-            size
-            for key, each in self._engines.items()
-            for size in each.sizes()
-            if old is not None and key[:2] == _key(old)
-        ]
-        try:
-            await asyncio.to_thread(_probe, engine, sizes)
-        except Exception as error:
-            self._engines.pop((*_key(bundle), backend), None)
-            log.exception("bundle %s fails its probe on %s", _label(bundle), backend)
-            raise Problem(
-                500,
-                "bad-bundle",
-                f"the bundle '{_label(bundle)}' fails its probe on {backend}: {error}",
-            ) from error
-
-    def _take(self, bundle: Bundle, old: Bundle | None) -> None:
+    def take(self, bundle: Bundle) -> None:
         """From now on this bundle answers; what runs still holds the engine that it runs on."""
-        self._bundles.setdefault(bundle.effect, {})[bundle.name] = bundle
-        for key in list(self._engines) if old is not None else ():
-            if old is not None and key[:2] == _key(old) != _key(bundle):
+        known = self._bundles.setdefault(bundle.effect, {})
+        old, known[bundle.name] = known.get(bundle.name), bundle
+        if old is not None and key_of(old) != key_of(bundle):
+            for key in [key for key in self._engines if key[:2] == key_of(old)]:
                 del self._engines[key]
-        log.info("bundle %s is now %s, from %s", _label(bundle), bundle.short_hash, bundle.path)
+            log.info("bundle %s is now %s, from %s", label(bundle), bundle.short_hash, bundle.path)
+        self.ready = True
 
-    async def _verified(self) -> tuple[dict[str, dict[str, Bundle]], list[str]]:
+    def drop(self, bundle: Bundle) -> None:
+        """From now on nothing answers under its name."""
+        del self._bundles[bundle.effect][bundle.name]
+
+    def forget(self, bundle: Bundle, backend: Backend) -> None:
+        """Don't keep its engine."""
+        self._engines.pop((*key_of(bundle), backend), None)
+
+    def sizes(self, bundle: Bundle) -> list[tuple[int, int]]:
+        """The (height, width) that its engines have compiled."""
+        mine = [each for key, each in self._engines.items() if key[:2] == key_of(bundle)]
+        return [size for engine in mine for size in engine.sizes()]
+
+    async def verified(self) -> tuple[Bundles, list[str]]:
         """The sound bundles of the folders, and the labels of the others."""
         refused = []
-        found: dict[str, dict[str, Bundle]] = {}
+        found: Bundles = {}
         folders = bundle_folders(*self.roots)
-        for hidden in (f for root in self.roots for f in bundle_folders(root) if f not in folders):
+        every = (f for root in self.roots for f in bundle_folders(root))
+        for hidden in (f for f in every if f not in folders and not self.ready):
             log.warning("%s isn't served: a folder named before has that bundle too", hidden)
         for folder in folders:
-            label = f"{folder.parent.name}/{folder.name}"
+            name = f"{folder.parent.name}/{folder.name}"
             try:
                 bundle = await asyncio.to_thread(versions.load, folder)
             except (DeepshadeError, OSError) as error:
-                refused.append(label)
-                log.error("bundle %s from %s is refused: %s", label, folder.parents[1], error)
+                refused.append(name)
+                log.error("bundle %s from %s is refused: %s", name, folder.parents[1], error)
                 continue
             found.setdefault(bundle.effect, {})[bundle.name] = bundle
             if not self.ready:
-                log.info("bundle %s (%s) from %s", label, bundle.short_hash, folder.parents[1])
+                log.info("bundle %s (%s) from %s", name, bundle.short_hash, folder.parents[1])
         return found, refused
 
     def bundles(self, effect: str) -> list[Bundle]:
@@ -225,7 +152,7 @@ class Models:
 
         Raises Problem 500 when a library refuses the graph.
         """
-        key = (*_key(bundle), backend)
+        key = (*key_of(bundle), backend)
         if key in self._engines:
             self._engines.move_to_end(key)
             return self._engines[key]
@@ -236,7 +163,7 @@ class Models:
     async def ms_per_megapixel(self, bundle: Bundle, backend: Backend) -> float:
         """What the network takes, as timed while it warms up, when that is first asked: never
         anew, so that the same request gets the same bundle."""
-        key = (*_key(bundle), backend)
+        key = (*key_of(bundle), backend)
         if key not in self._speeds:
             engine = await self.engine(bundle, backend)
             await asyncio.to_thread(engine.warm)
@@ -249,44 +176,38 @@ class Models:
         return list(self._engines.values())
 
     async def _load(self, key: Key, bundle: Bundle) -> Engine:
-        label, backend = _label(bundle), key[-1]
+        name, backend = label(bundle), key[-1]
         try:
             engine = await asyncio.to_thread(load_engine, bundle, backend, threads=self._threads)
         except Exception as error:  # libraries raise what they like
-            log.exception("bundle %s can't be loaded on %s", label, backend)
+            log.exception("bundle %s can't be loaded on %s", name, backend)
             raise Problem(
                 500,
                 "bad-bundle",
-                f"the bundle '{label}' can't be loaded on {backend}; the service's log says why",
+                f"the bundle '{name}' can't be loaded on {backend}; the service's log says why",
                 fix="choose another ?bundle= or ?engine=, or export the bundle again",
             ) from error
         finally:
             del self._loading[key]
-        log.info("bundle %s is loaded on %s", label, backend)
+        log.info("bundle %s is loaded on %s", name, backend)
         self._engines[key] = engine
         if len(self._engines) > MAX_ENGINES:
             self._engines.popitem(last=False)
         return engine
 
 
-def _label(bundle: Bundle) -> str:
+def _all(bundles: Bundles) -> list[Bundle]:
+    return [bundle for each in bundles.values() for bundle in each.values()]
+
+
+def label(bundle: Bundle) -> str:
+    """Its effect and name, for people."""
     return f"{bundle.effect}/{bundle.name}"
 
 
-def _key(bundle: Bundle) -> tuple[Path, str]:
+def key_of(bundle: Bundle) -> tuple[Path, str]:
+    """What tells it from another of the same name: its real folder and its graph's hash."""
     return bundle.path, bundle.sha256
-
-
-def _probe(engine: Engine, sizes: Sequence[tuple[int, int]]) -> None:
-    """Raises EngineError for answers that aren't finite; what the engine raises for others."""
-    bundle = engine.bundle
-    side = -(-PROBE // bundle.size_multiple) * bundle.size_multiple
-    given = (black(bundle.environment),) if bundle.environment else ()
-    if not np.isfinite(engine.predict(noise(bundle, side, side), *given)).all():
-        raise EngineError("it gives numbers that aren't finite")
-    for height, width in sizes:
-        if not (height % bundle.size_multiple or width % bundle.size_multiple):
-            engine.prepare(height, width)
 
 
 def _error(bundle: Bundle) -> tuple[float, str]:

@@ -55,6 +55,7 @@ class Queue:
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
+            self._lock.close()
             raise ConfigError(
                 "folder", detail=f"another trainer service uses {settings.folder} (--folder)"
             ) from None
