@@ -22,7 +22,7 @@ from deepshade_trainer.service.problems import Problem
 from deepshade_trainer.service.publishing import Publisher, describe
 from deepshade_trainer.service.queue import Queue
 from deepshade_trainer.service.request import TrainRequest, job_of
-from deepshade_trainer.service.store import OVER, QUEUED, Job, Store
+from deepshade_trainer.service.store import AGAIN, OVER, QUEUED, Job, Store
 from deepshade_trainer.service.uploads import Uploads
 from deepshade_trainer.tuning.events import last_event, read_events
 
@@ -58,13 +58,12 @@ class Trainer:
         """The job that a request gets, and whether it waits anew. Blocks."""
         job, plan, rendering = job_of(effect, asked, self.settings, self.uploads)
         known = self.store.get(job.id)
-        if known is None or known.state in OVER:
+        if known is None or known.state in AGAIN:
             waiting = self.store.waiting()
             if waiting >= self.settings.queue:
                 raise Problem(
                     429, "queue-full", f"{waiting} jobs wait already", "ask again later", 60
                 )
-        if known is None or known.state not in ("running",):
             folder = self.queue.folder(job.id)
             plan.write(folder)
             if rendering is not None:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from deepshade.bundles import CONFIG
+from deepshade.bundles import CONFIG, MODEL
 from deepshade.errors import BundleError
 from deepshade.versions import Alias, Version, aliases
 from deepshade_trainer.service.config import Settings
@@ -142,12 +142,12 @@ def _document(read: Callable[[], bytes]) -> dict[str, Any]:
 def describe(alias: Alias) -> dict[str, Any]:
     """An alias and its versions as JSON values."""
     current = alias.current
-    number = alias.numbers()
+    files = {} if current is None else alias.version(current).files
     return {
         "effect": alias.effect,
         "name": alias.name,
         "number": current,
-        "versions": number,
+        "versions": alias.numbers(),
         "pinned": alias.pinned,
-        "sha256": alias.version(current).sha256 if current is not None else None,
+        "sha256": files.get(MODEL),
     }

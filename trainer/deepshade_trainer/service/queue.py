@@ -9,7 +9,7 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -75,21 +75,19 @@ class Queue:
         await self._patiently(self._store.prepare)
         try:
             while True:
+                self._news.clear()  # before the store is asked, or what comes meanwhile is missed
                 while len(self._running) < self._settings.at_a_time:
                     job = await self._patiently(self._store.claim)
                     if job is None:
                         break
                     await self._begin(job)
-                self._news.clear()
                 await self._news.wait()
         finally:
             self._stopping = True
             for process in self._running.values():
-                _signal(process, signal.SIGTERM)
-            if self._tasks:
-                await asyncio.wait(self._tasks, timeout=GRACE)
-            for process in self._running.values():
-                _signal(process, signal.SIGKILL)
+                self._keep(self._end(process))
+            while self._tasks:
+                await asyncio.wait(self._tasks)
             fcntl.flock(self._lock, fcntl.LOCK_UN)
             self._lock.close()
 
@@ -104,8 +102,21 @@ class Queue:
         if process is None:
             return False
         self._cancelled.add(job.id)
-        _signal(process, signal.SIGTERM)
+        self._keep(self._end(process))
         return True
+
+    async def _end(self, process: asyncio.subprocess.Process) -> None:
+        """Ask a process to stop, and then see to it."""
+        _signal(process, signal.SIGTERM)
+        try:
+            await asyncio.wait_for(process.wait(), GRACE)
+        except TimeoutError:
+            _signal(process, signal.SIGKILL)
+
+    def _keep(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def _begin(self, job: Job) -> None:
         process = await asyncio.create_subprocess_exec(
@@ -119,9 +130,7 @@ class Queue:
         )
         log.info("job %s of %s/%s begins", job.id, job.effect, job.name)
         self._running[job.id] = process
-        task = asyncio.create_task(self._watch(job, process))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._keep(self._watch(job, process))
 
     async def _watch(self, job: Job, process: asyncio.subprocess.Process) -> None:
         code = await process.wait()
@@ -164,12 +173,14 @@ class Queue:
             return FAILED, {"sentence": f"not published: {error}", "fix": "ask for it again"}
 
     async def _patiently(self, ask: Callable[[], T]) -> T:
-        """What the store answers, however long its database is away."""
+        """What the store answers, however long its database is away, unless we stop."""
         told = False
         while True:
             try:
                 return await asyncio.to_thread(ask)
             except SQLAlchemyError as error:
+                if self._stopping:
+                    raise
                 if not told:
                     log.error("the database can't be asked, and will be again: %s", error)
                 told = True
