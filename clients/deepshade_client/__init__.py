@@ -20,6 +20,7 @@ from deepshade_client.exceptions import (
 from deepshade_client.mock import MockTransport, mock_answer
 from deepshade_client.request import Options
 from deepshade_client.settings import NO_RETRY, Retry, Timeout
+from deepshade_client.trainer import Trainer
 
 __all__ = [
     "NO_RETRY",
@@ -43,6 +44,7 @@ __all__ = [
     "TimedOut",
     "Timeout",
     "TooLarge",
+    "Trainer",
     "TransportError",
     "mock_answer",
 ]

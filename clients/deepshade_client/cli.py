@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from deepshade.cli import CONTEXT, Version, run
+from deepshade_client import training
 from deepshade_client.exceptions import NotReady, TransportError
 from deepshade_client.settings import DEFAULT_SERVER
 
@@ -470,6 +471,10 @@ def models(server: Server = DEFAULT_SERVER, as_json: AsJson = False) -> None:
 
     found = [{"effect": e["name"], **bundle} for e in _effects(server) for bundle in e["bundles"]]
     (_print_json if as_json else print_models)(found)
+
+
+for command in (training.train, training.jobs, training.bundles, training.pin, training.rollback):
+    app.command()(command)
 
 
 def main(arguments: list[str] | None = None) -> int:

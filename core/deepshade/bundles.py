@@ -177,6 +177,16 @@ def bundle_folders(*roots: Path | str) -> list[Path]:
     return [found[key] for key in sorted(found)]
 
 
+def check_name(name: str) -> None:
+    """Raises ConfigError for what no bundle may be called."""
+    if not _label(name):
+        raise ConfigError(
+            "name",
+            detail=f"{name[:100]!r} can't be a bundle's name: up to 64 letters, digits, '.', '_' "
+            "and '-', the first a letter or digit",
+        )
+
+
 def write_config(
     path: Path | str,
     config: Mapping[str, Any],

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 # the first of these that brings a package is the one to install for it; the report borrows
-_ORDER = ("client", "service", "live", "workers", "trainer", "report")
+_ORDER = ("client", "service", "live", "workers", "trainer", "report", "postgres", "cluster")
 # where a package isn't imported by its own name, with _ for -
 _MODULES = {"openexr": "OpenEXR", "pillow": "PIL"}
 # imported by a package of ours rather than by us

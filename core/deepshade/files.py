@@ -19,7 +19,7 @@ def replacing(path: Path) -> Iterator[Path]:
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -49,7 +49,7 @@ def shipped(kind: str) -> Path:
     return packed if packed.is_dir() else Path(__file__).resolve().parents[2] / kind
 
 
-def _sync_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """The new name too survives a power cut. Windows can't open folders, nor needs to."""
     if os.name == "nt":
         return

@@ -27,7 +27,8 @@ class Shard:
 
     A record holds what renders the sample again: `scene`, `seed`, the settings that are set
     (`radius`, `focus`, ...), `camera` (field of view, frame, window origin, worldToCamera), and
-    `displacements` where objects move. Under an environment also `environment` (its name), `rotate`
+    `displacements` where objects move. A sample with a `turn` is that view turned by that symmetry
+    (`deepshade.symmetry`). Under an environment also `environment` (its name), `rotate`
     and `environment_sha256`: `deepshade.environments.stored` reads it.
     """
 

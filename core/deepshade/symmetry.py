@@ -1,8 +1,8 @@
 """The 8 quarter turns and mirrors of an image, with camera-space vectors turned along.
 
 Screen-space shading has no preferred direction, so each rendered view gives eight to learn from.
-They cost less to make than to read, so the trainer applies them to each batch rather than the
-workers storing them.
+They cost less to make than to read, so the trainer applies them to each batch; the workers store
+them only where another trainer is to read plain shards (`datagen --augment`).
 """
 
 from __future__ import annotations

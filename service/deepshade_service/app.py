@@ -21,7 +21,8 @@ from deepshade.engines import Engine
 from deepshade.errors import EngineError
 from deepshade.files import shipped
 from deepshade.machine import trim
-from deepshade_service import composition, pages, problems, upload_routes
+from deepshade.tokens import TokenGuard
+from deepshade_service import bundle_routes, composition, pages, problems, upload_routes
 from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
 from deepshade_service.config import Settings, environment_limits
@@ -148,6 +149,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(Guard, hosts=service.settings.hosts, origins=service.settings.origins)
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
+    app.add_middleware(TokenGuard, token=service.settings.token, guarded=bundle_routes.guarded)
 
     @app.post(
         "/shade/{effect}",
@@ -196,6 +198,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     async def one_effect(effect: str) -> dict[str, Any]:
         return _effect(find_effect(effect).name, service.models)
 
+    bundle_routes.install(app, service.models)
     routes.install(app, service.environments, service.uploads, service.settings)
     live_routes.install(app, service, service.sessions, service.tokens)
     upload_routes.install(app, service)

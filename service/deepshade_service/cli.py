@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import logging
-import re
 import signal
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+from deepshade.serving import listen, logging_config
 
 if TYPE_CHECKING:
     from deepshade_service.config import Settings
@@ -88,14 +88,6 @@ def serve(
             " own; '*' any; repeatable."
         ),
     ] = None,
-    token: Annotated[
-        str | None,
-        typer.Option(
-            envvar="DEEPSHADE_TOKEN",
-            help="What who publishes live must show; needed where others can reach --host.",
-            show_default=False,
-        ),
-    ] = None,
     live_sessions: Annotated[int, typer.Option(min=0, help="Most live sessions.")] = 8,
     live_viewers: Annotated[int, typer.Option(min=0, help="Most viewers of each.")] = 32,
     live_frame: Annotated[str, typer.Option(help="Largest live frame.")] = "64M",
@@ -117,7 +109,8 @@ def serve(
     from deepshade.bundles import bundle_roots, overlooked
     from deepshade.errors import ConfigError
     from deepshade.machine import cpu_count
-    from deepshade_service.config import Settings, default_limits, default_memory, is_loopback
+    from deepshade.tokens import configured, is_loopback
+    from deepshade_service.config import Settings, default_limits, default_memory
     from deepshade_service.memory import parse_size
     from deepshade_service.models import check_backend
 
@@ -158,7 +151,7 @@ def serve(
         live_viewers=live_viewers,
         live_frame=parse_size(live_frame),
         live_rate=live_rate,
-        token=_checked_token(token),
+        token=configured(),
         beyond=not is_loopback(host),
     )
     if settings.beyond and settings.token is None and live_sessions:
@@ -169,45 +162,6 @@ def serve(
         )
     with listen(host, port) as listener:
         _run(settings, listener, log_level)
-
-
-def _checked_token(token: str | None) -> str | None:
-    from deepshade.errors import ConfigError
-
-    if token is not None and not re.fullmatch(r"[\w.~-]{16,256}", token, re.ASCII):
-        raise ConfigError(
-            "token",
-            detail="the token must be 16 to 256 letters, digits or - . _ ~, as of"
-            " `openssl rand -hex 32`",
-        )
-    return token
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A listening socket; its port is known before the server starts, also when it was 0.
-
-    Its protocol is stated, because asyncio sets TCP_NODELAY only on sockets that say TCP, and
-    without it every small answer takes 40 ms (Nagle's algorithm against delayed acknowledgement).
-    """
-    from deepshade.errors import DeepshadeError
-
-    listener = None
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        listener = socket.socket(family, kind, protocol)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(address)
-        listener.listen(2048)
-    except OSError as error:
-        if listener is not None:
-            listener.close()
-        raise DeepshadeError(
-            f"can't listen at {host}, port {port}: {error.strerror or error}",
-            fix="choose another --port (0 takes a free one) or --host",
-        ) from error
-    return listener
 
 
 def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
@@ -222,7 +176,7 @@ def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
     app = create_app(settings)
     config = uvicorn.Config(
         app,
-        log_config=_logging(log_level),
+        log_config=logging_config(log_level),
         # Without it uvicorn waits for open sockets for ever.
         timeout_graceful_shutdown=max(1, round(settings.grace)),
         server_header=False,
@@ -236,29 +190,3 @@ def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)
     Server(config, app.state.service).run(sockets=[listener])
-
-
-_POLLS = ("/healthz", "/readyz", "/metrics")
-
-
-def _no_poll(record: logging.LogRecord) -> bool:
-    """Whether a line of uvicorn's access log is about anything else than a health poll."""
-    _, _, path, *_ = record.args if isinstance(record.args, tuple) else ("", "", "")
-    return str(path).partition("?")[0] not in _POLLS
-
-
-def _logging(level: str) -> dict[str, Any]:
-    """uvicorn's own set-up, and ours beside it."""
-    from copy import deepcopy
-
-    from uvicorn.config import LOGGING_CONFIG
-
-    config = deepcopy(LOGGING_CONFIG)
-    for formatter in config["formatters"].values():
-        formatter["fmt"] = f"%(asctime)s {formatter['fmt']}"
-    config["filters"] = {"polls": {"()": lambda: _no_poll}}
-    config["handlers"]["access"]["filters"] = ["polls"]
-    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "deepshade"):
-        config["loggers"].setdefault(name, {"handlers": ["default"], "propagate": False})
-        config["loggers"][name]["level"] = level.upper()
-    return config

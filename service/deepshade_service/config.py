@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -55,9 +54,9 @@ class Settings:
     use it, beside its own (`guard.Guard`).
 
     Of live sessions: how many, how many `live_viewers` each, the bytes of a frame, and how many a
-    second a publisher may send. `token` is what publishers show, and viewers, if they have no
-    link; `beyond` says that the service can be reached from other machines, where there are none
-    without it.
+    second a publisher may send. `token` is what publishers show, viewers who have no link, and
+    whoever changes which bundles answer (`deepshade.tokens`); `beyond` says that other machines can
+    reach the service, where live sessions are closed without it.
     """
 
     models: Path | Sequence[Path] = field(default_factory=bundle_roots)
@@ -108,14 +107,6 @@ class Settings:
         _require("queue", self.queue >= 0, "0 or more")
         for key in ("body_timeout", "idle_trim", "grace", "keep_seconds"):
             _require(key, getattr(self, key) > 0, "more than 0 seconds")
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach what listens at `host`."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _require(key: str, ok: bool, range_: str) -> None:

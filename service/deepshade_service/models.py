@@ -8,6 +8,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
 
+from deepshade import versions
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS, Effect
 from deepshade.engines import Backend, Engine, available, choose, load_engine
@@ -18,7 +19,8 @@ log = logging.getLogger("deepshade.service")
 
 MAX_ENGINES = 12  # in memory, one for each effect and a few; the one used longest ago goes
 
-Key = tuple[Path, Backend]
+Bundles = dict[str, dict[str, Bundle]]  # by effect and name
+Key = tuple[Path, str, Backend]  # a bundle's real folder and hash, and what it runs on
 
 
 class Models:
@@ -37,10 +39,11 @@ class Models:
     ) -> None:
         self.roots = (roots,) if isinstance(roots, Path) else tuple(roots)
         self.ready = False
+        self.loaded = False  # whether all were looked at, if only to find none
         self.refused: list[str] = []
         self._threads = threads
         self._pinned = pinned
-        self._bundles: dict[str, dict[str, Bundle]] = {}
+        self._bundles: Bundles = {}
         self._engines: OrderedDict[Key, Engine] = OrderedDict()
         self._loading: dict[Key, asyncio.Task[Engine]] = {}
         self._speeds: dict[Key, float] = {}
@@ -50,25 +53,59 @@ class Models:
         if not await asyncio.to_thread(available):
             log.error("the service stays unready: no engine is installed")
             return
-        found: dict[str, dict[str, Bundle]] = {}
-        folders = bundle_folders(*self.roots)
-        for hidden in (f for root in self.roots for f in bundle_folders(root) if f not in folders):
-            log.warning("%s isn't served: a folder named before has that bundle too", hidden)
-        for folder in folders:
-            label = f"{folder.parent.name}/{folder.name}"
-            try:
-                bundle = await asyncio.to_thread(Bundle.load, folder)
-            except (DeepshadeError, OSError) as error:
-                self.refused.append(label)
-                log.error("bundle %s from %s is refused: %s", label, folder.parents[1], error)
-                continue
-            found.setdefault(bundle.effect, {})[bundle.name] = bundle
-            log.info("bundle %s (%s) from %s", label, bundle.short_hash, folder.parents[1])
-        self._bundles = found
-        self.ready = bool(found)
-        if not found:
+        self._bundles, self.refused = await self.verified()
+        self.ready, self.loaded = bool(self._bundles), True
+        if not self.ready:
             places = ", ".join(map(str, self.roots))
             log.error("no usable bundle under %s: the service stays unready", places)
+
+    def every(self) -> list[Bundle]:
+        """All bundles that answer."""
+        return _all(self._bundles)
+
+    def take(self, bundle: Bundle) -> None:
+        """From now on this bundle answers; what runs still holds the engine that it runs on."""
+        known = self._bundles.setdefault(bundle.effect, {})
+        old, known[bundle.name] = known.get(bundle.name), bundle
+        if old is not None and key_of(old) != key_of(bundle):
+            for key in [key for key in self._engines if key[:2] == key_of(old)]:
+                del self._engines[key]
+            log.info("bundle %s is now %s, from %s", label(bundle), bundle.short_hash, bundle.path)
+        self.ready = True
+
+    def drop(self, bundle: Bundle) -> None:
+        """From now on nothing answers under its name."""
+        del self._bundles[bundle.effect][bundle.name]
+
+    def forget(self, bundle: Bundle, backend: Backend) -> None:
+        """Don't keep its engine."""
+        self._engines.pop((*key_of(bundle), backend), None)
+
+    def sizes(self, bundle: Bundle) -> list[tuple[int, int]]:
+        """The (height, width) that its engines have compiled."""
+        mine = [each for key, each in self._engines.items() if key[:2] == key_of(bundle)]
+        return [size for engine in mine for size in engine.sizes()]
+
+    async def verified(self) -> tuple[Bundles, list[str]]:
+        """The sound bundles of the folders, and the labels of the others."""
+        refused = []
+        found: Bundles = {}
+        folders = bundle_folders(*self.roots)
+        every = (f for root in self.roots for f in bundle_folders(root))
+        for hidden in (f for f in every if f not in folders and not self.ready):
+            log.warning("%s isn't served: a folder named before has that bundle too", hidden)
+        for folder in folders:
+            name = f"{folder.parent.name}/{folder.name}"
+            try:
+                bundle = await asyncio.to_thread(versions.load, folder)
+            except (DeepshadeError, OSError) as error:
+                refused.append(name)
+                log.error("bundle %s from %s is refused: %s", name, folder.parents[1], error)
+                continue
+            found.setdefault(bundle.effect, {})[bundle.name] = bundle
+            if not self.ready:
+                log.info("bundle %s (%s) from %s", name, bundle.short_hash, folder.parents[1])
+        return found, refused
 
     def bundles(self, effect: str) -> list[Bundle]:
         """The bundles of one effect, the one with the least error first; [] while loading."""
@@ -115,7 +152,7 @@ class Models:
 
         Raises Problem 500 when a library refuses the graph.
         """
-        key = bundle.path, backend
+        key = (*key_of(bundle), backend)
         if key in self._engines:
             self._engines.move_to_end(key)
             return self._engines[key]
@@ -126,7 +163,7 @@ class Models:
     async def ms_per_megapixel(self, bundle: Bundle, backend: Backend) -> float:
         """What the network takes, as timed while it warms up, when that is first asked: never
         anew, so that the same request gets the same bundle."""
-        key = bundle.path, backend
+        key = (*key_of(bundle), backend)
         if key not in self._speeds:
             engine = await self.engine(bundle, backend)
             await asyncio.to_thread(engine.warm)
@@ -139,24 +176,38 @@ class Models:
         return list(self._engines.values())
 
     async def _load(self, key: Key, bundle: Bundle) -> Engine:
-        label = f"{bundle.effect}/{bundle.name}"
+        name, backend = label(bundle), key[-1]
         try:
-            engine = await asyncio.to_thread(load_engine, bundle, key[1], threads=self._threads)
+            engine = await asyncio.to_thread(load_engine, bundle, backend, threads=self._threads)
         except Exception as error:  # libraries raise what they like
-            log.exception("bundle %s can't be loaded on %s", label, key[1])
+            log.exception("bundle %s can't be loaded on %s", name, backend)
             raise Problem(
                 500,
                 "bad-bundle",
-                f"the bundle '{label}' can't be loaded on {key[1]}; the service's log says why",
+                f"the bundle '{name}' can't be loaded on {backend}; the service's log says why",
                 fix="choose another ?bundle= or ?engine=, or export the bundle again",
             ) from error
         finally:
             del self._loading[key]
-        log.info("bundle %s is loaded on %s", label, key[1])
+        log.info("bundle %s is loaded on %s", name, backend)
         self._engines[key] = engine
         if len(self._engines) > MAX_ENGINES:
             self._engines.popitem(last=False)
         return engine
+
+
+def _all(bundles: Bundles) -> list[Bundle]:
+    return [bundle for each in bundles.values() for bundle in each.values()]
+
+
+def label(bundle: Bundle) -> str:
+    """Its effect and name, for people."""
+    return f"{bundle.effect}/{bundle.name}"
+
+
+def key_of(bundle: Bundle) -> tuple[Path, str]:
+    """What tells it from another of the same name: its real folder and its graph's hash."""
+    return bundle.path, bundle.sha256
 
 
 def _error(bundle: Bundle) -> tuple[float, str]:

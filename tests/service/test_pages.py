@@ -67,8 +67,8 @@ def test_every_curl_fails_when_the_service_does():
 def test_the_log_has_times_and_no_health_polls():
     code = """
 import logging.config
-from deepshade_service.cli import _logging
-logging.config.dictConfig(_logging("info"))
+from deepshade.serving import logging_config
+logging.config.dictConfig(logging_config("info"))
 for path in ("/healthz", "/readyz?x=1", "/metrics", "/shade/ao?radius=1"):
     logging.getLogger("uvicorn.access").info(
         '%s - "%s %s HTTP/%s" %d', "1.2.3.4:5", "GET", path, "1.1", 200)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,12 @@ from safetensors.numpy import save
 from deepshade.camera import Camera
 from deepshade.gbuffer.derivation import normals_from_positions
 from deepshade.manifest import Manifest, Shard
+from deepshade_trainer.export import export
 from deepshade_trainer.networks import FoldConfig
 from deepshade_trainer.recipe import Recipe
+from deepshade_trainer.run import Run
+from deepshade_trainer.training import train
+from deepshade_trainer.tuning.plan import Plan
 
 SIZE = 64
 
@@ -40,10 +45,21 @@ def sample(seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def write_data(folder: Path, count: int = 24, broken: tuple[int, ...] = ()) -> Path:
-    """A data folder of two shards; the samples numbered `broken` hold a NaN."""
+def write_data(
+    folder: Path,
+    count: int = 24,
+    broken: tuple[int, ...] = (),
+    reference: Callable[[tuple[int, ...]], np.ndarray] | None = None,
+) -> Path:
+    """A data folder of two shards; the samples numbered `broken` hold a NaN.
+
+    `reference` makes references of a shape in place of the right ones.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     samples = [sample(k) for k in range(count)]
+    for each in samples if reference else ():
+        shape = each["reference_ao"].shape
+        each["reference_ao"] = reference(shape).astype(np.float16)
     for k in broken:
         samples[k]["position"][0, 30, 30] = np.nan
     schema = {
@@ -68,9 +84,42 @@ def data(tmp_path_factory: Any) -> Path:
     return write_data(tmp_path_factory.mktemp("data") / "waves")
 
 
+NETWORK = FoldConfig(
+    widths=(8, 12), steps=(2,), down=(1, 1), up=(1,), normal=0, position=3, bias=0.85
+)
+
+
 @pytest.fixture
 def recipe() -> Recipe:
-    network = FoldConfig(
-        widths=(8, 12), steps=(2,), down=(1, 1), up=(1,), normal=0, position=3, bias=0.85
+    return Recipe(network=NETWORK, batch=4, steps=6, warmup=2, val_fraction=0.2, precision="fp32")
+
+
+@pytest.fixture(scope="session")
+def base(data: Path, tmp_path_factory: Any) -> Path:
+    """A bundle `ao/balanced` that has learnt next to nothing."""
+    folder = tmp_path_factory.mktemp("base")
+    recipe = Recipe(network=NETWORK, batch=4, steps=2, warmup=1, precision="fp32")
+    list(train(recipe, [data], Run(folder / "run")))
+    return export(Run(folder / "run"), folder / "models/ao/balanced", [data])[0].path
+
+
+@pytest.fixture(scope="session")
+def judges(tmp_path_factory: Any) -> Path:
+    """A few views that must not get worse."""
+    return write_data(tmp_path_factory.mktemp("judges") / "test", 2)
+
+
+@pytest.fixture
+def plan(base: Path, data: Path, judges: Path) -> Plan:
+    """A job that makes `base` better in moments."""
+    return Plan(
+        effect="ao",
+        base=str(base),
+        name="balanced",
+        data=(str(data),),
+        test=(str(judges),),
+        steps=10,
+        batch=4,
+        lr=4e-3,
+        slower=10.0,
     )
-    return Recipe(network=network, batch=4, steps=6, warmup=2, val_fraction=0.2, precision="fp32")

@@ -151,7 +151,8 @@ def test_a_killed_run_goes_on(data: Path, tmp_path: Path) -> None:
     settings += ["network.widths=[8,12]", "network.steps=[2]", "network.down=[1,1]"]
     settings += ["network.up=[1]", "network.rings=[1]", "network.fine_rings=[1]"]
     settings += ["network.detail=[]"]
-    often = "from deepshade_trainer import training; training.SAVE_EVERY = 5; "
+    often = "from deepshade_trainer import training; "
+    often += "every = training.Every; training.Every = lambda: every(save=5); "
     code = f"import sys; {often}from deepshade.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "train", "ao", "--data", str(data)]
     command += ["--threads", "1", "--out", str(out), *(x for s in settings for x in ("--set", s))]

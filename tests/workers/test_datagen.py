@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from deepshade import exr
+from deepshade import exr, symmetry
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS
 from deepshade.environments.stored import read_stored, stored_path
@@ -35,6 +35,7 @@ from deepshade_workers.datagen import (
     generate,
     make_sample,
     make_shard,
+    open_manifest,
 )
 from deepshade_workers.maps import MAX_HEIGHT
 from deepshade_workers.records import view_of
@@ -402,3 +403,27 @@ def test_no_cluster_at_the_address(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert "no Ray cluster for us at" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_augmented_views_are_stored_in_all_their_turns(tmp_path: Path) -> None:
+    """Each is the symmetry of the plain one; where the world is seen, only the quarter turns."""
+    plain = DataSpec(scenes=SCENES[:1], views=2, size=16, frame=16, spp=4, seed=3, shard_size=2)
+    spec = replace(plain, augment=True)
+    assert spec.turns == symmetry.ALL
+    assert replace(spec, effects=("ao", "do")).turns == symmetry.ROTATIONS
+    first = make_shard(plain, 0, tmp_path, lambda: None)
+    before = load_file(tmp_path / first.file)
+    shard = make_shard(spec, 0, tmp_path, lambda: None)
+    after = load_file(tmp_path / shard.file)
+    assert [record["turn"] for record in shard.samples] == list(range(8)) * 2
+    for name, planes in before.items():
+        for view in range(2):
+            for turn in range(8):
+                expected = symmetry.apply(planes[view], name, turn)
+                assert np.array_equal(after[name][8 * view + turn], expected), (name, turn)
+    manifest = open_manifest(spec, tmp_path).with_shard(shard)
+    assert _complete(spec, 0, manifest, tmp_path)
+    assert not _complete(plain, 0, manifest, tmp_path)
+    assert "augment" not in plain.settings()  # older sets can still be completed
+    with pytest.raises(ConfigError, match="--layers"):
+        replace(spec, effects=("do",), layers=("do_directions",))

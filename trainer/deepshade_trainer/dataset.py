@@ -167,15 +167,23 @@ class Dataset:
     def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, ...]:
         """G-buffers (N, C, H, W) and references (N, outputs, H, W) to learn from.
 
-        Each sample is turned by one of the effect's symmetries; some have 16-bit lengths, some
-        directions that are too short; networks run per channel see one colour channel.
+        Each sample is turned by one of the effect's symmetries (`turn`); some have 16-bit lengths,
+        some directions that are too short; networks run per channel see one colour channel.
         """
         drawn = [self._drawn(number, rng) for number in numbers]
         return tuple(torch.from_numpy(np.stack(each)) for each in zip(*drawn, strict=True))
 
+    def turn(self, number: int, rng: np.random.Generator) -> int:
+        """A symmetry of the effect to turn a sample by; none for one that is a stored turn itself.
+
+        Data sets of 'datagen --augment' hold all of a view's turns.
+        """
+        drawn = self.effect.symmetries[int(rng.integers(len(self.effect.symmetries)))]
+        return 0 if "turn" in self.entries[number].record else drawn
+
     def _drawn(self, number: int, rng: np.random.Generator) -> tuple[NDArray[np.float32], ...]:
         sample = self.load(number)
-        turn = self.effect.symmetries[int(rng.integers(len(self.effect.symmetries)))]
+        turn = self.turn(number, rng)
         reference = symmetry.apply(sample[self.reference], None, turn)
         gbuffer, channel = self._seen(number, sample, turn, rng)
         return gbuffer, reference if channel is None else reference[channel : channel + 1]

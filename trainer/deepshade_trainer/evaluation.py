@@ -109,12 +109,15 @@ def evaluate(
     bundle: Bundle,
     folders: Sequence[Path],
     *,
+    numbers: Sequence[int] | None = None,
     min_contrast: float | None = None,
     limit: int | None = None,
     variant: Variant | None = None,
     backend: Backend = REFERENCE,
 ) -> Iterator[Row]:
     """Shade every sample that shows something: by default as much as the effect's row says.
+
+    With `numbers` only those samples are looked at.
 
     Each is lit by the environment that it was rendered under. Where the references' error is known,
     the figure `noise` is what of the DSSIM it explains (`judging.floor`).
@@ -133,7 +136,8 @@ def evaluate(
         if name not in bundle.inputs:
             raise ConfigError(name, bundle.inputs, detail=f"{bundle.effect} has no input {name!r}")
     found = 0
-    for number, entry in enumerate(data.entries):
+    for number in range(len(data.entries)) if numbers is None else numbers:
+        entry = data.entries[number]
         sample = data.load(number)
         reference = sample[data.reference]
         lit = data.surroundings(number)

@@ -46,7 +46,7 @@ class Resident(Dataset):
         effect, inputs, references = self.effect, [], []
         for number in numbers:
             gbuffer, reference = self._sample(number)
-            turn = effect.symmetries[int(rng.integers(len(effect.symmetries)))]
+            turn = self.turn(number, rng)
             gbuffer = torch.einsum("ij,jhw->ihw", self._turns[turn], _moved(gbuffer, turn))
             reference = _moved(reference, turn)
             if rng.random() < HALF_LENGTHS:

@@ -20,7 +20,7 @@ Tensors = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Run:
-    """A run's folder: `recipe.json`, `checkpoint.safetensors`, `metrics.json`, `log/`."""
+    """A run's folder: recipe, checkpoint, metrics, a preview, and TensorBoard's `log/`."""
 
     folder: Path
 
@@ -38,6 +38,11 @@ class Run:
     def metrics(self) -> Path:
         """Validation figures, one entry each time."""
         return self.folder / "metrics.json"
+
+    @property
+    def preview(self) -> Path:
+        """The last validation's first views: ours, the reference, the error."""
+        return self.folder / "preview.png"
 
     @property
     def log(self) -> Path:

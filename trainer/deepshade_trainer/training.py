@@ -14,26 +14,37 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
-from deepshade import judging
+from deepshade import judging, pictures
 from deepshade.bundles import CONFIG, Bundle
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing
 from deepshade_trainer.dataset import Batch, Dataset, batches
 from deepshade_trainer.lit import Lit
-from deepshade_trainer.losses import dssim, parse_loss
+from deepshade_trainer.losses import parse_loss
 from deepshade_trainer.networks import Network, Shader, build, bundle_weights
 from deepshade_trainer.networks.openings import Openings
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
+from deepshade_trainer.validation import answered, validated
 
-SAVE_EVERY = 250
-VALIDATE_EVERY = 500
 VALIDATION_SAMPLES = 96
 MAX_BAD_BATCHES = 100
+
+# From a data set the numbers of samples to train on, where one may come several times, and of
+# those to validate on.
+Split = Callable[[Dataset], tuple[list[int], list[int]]]
+
+
+@dataclass(frozen=True)
+class Every:
+    """After how many steps a run saves, and validates; neither changes what it learns."""
+
+    save: int = 250
+    validate: int = 500
 
 
 @dataclass(frozen=True)
@@ -48,25 +59,46 @@ class Progress:
 
 
 def train(
-    recipe: Recipe, folders: Sequence[Path], run: Run, *, device: str = "cpu"
+    recipe: Recipe,
+    folders: Sequence[Path],
+    run: Run,
+    *,
+    device: str = "cpu",
+    split: Split | None = None,
+    every: Every | None = None,
 ) -> Iterator[Progress]:
     """Train until `recipe.steps`; an existing `run` goes on where its checkpoint stands.
 
     Yields progress after every step. Batches with non-finite inputs, loss or gradients teach
-    nothing: they are reported with the names of their samples and skipped.
+    nothing: they are reported with the names of their samples and skipped. Without a `split` some
+    scenes are held out, as the recipe says. In a process group of torch.distributed each process
+    learns from its part of every batch, and the first alone writes and validates.
 
     Raises:
         ConfigError: the run was begun with another recipe, or there is no such device.
         DataError: there is too little data, or almost all of it is non-finite.
     """
-    trainer = _Trainer(recipe, folders, run, device)
+    trainer = _Trainer(recipe, folders, run, device, split, every or Every())
     with _finish_on_signals() as stopped:
         yield from trainer.steps(stopped)
 
 
 class _Trainer:
-    def __init__(self, recipe: Recipe, folders: Sequence[Path], run: Run, device: str) -> None:
+    def __init__(
+        self,
+        recipe: Recipe,
+        folders: Sequence[Path],
+        run: Run,
+        device: str,
+        split: Split | None,
+        every: Every,
+    ) -> None:
         self.recipe, self.run, self.device = recipe, run, _device(device)
+        self.every, self.rank, self.world = every, *_place()
+        if recipe.batch % self.world:
+            raise ConfigError(
+                "batch", detail=f"{self.world} processes can't share a batch of {recipe.batch}"
+            )
         torch.manual_seed(recipe.seed)
         self.network = build(recipe.network).to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -79,7 +111,10 @@ class _Trainer:
             self.data = Dataset(folders, recipe.effect, per_channel=runs)
         else:
             self.data = Resident(folders, recipe.effect, per_channel=runs, device=self.device)
-        self.training, held = self.data.split(recipe.val_fraction, seed=recipe.seed)
+        if split is None:
+            self.training, held = self.data.split(recipe.val_fraction, seed=recipe.seed)
+        else:
+            self.training, held = split(self.data)
         if len(self.training) < recipe.batch:
             raise DataError(
                 f"{len(self.training)} samples don't fill a batch of {recipe.batch}",
@@ -91,7 +126,7 @@ class _Trainer:
                 f"the warm-up of {recipe.warmup} steps is longer than the run of {recipe.steps}: "
                 f"the rate never reaches {recipe.lr:g}; --set warmup={recipe.steps // 10} would do"
             )
-        if held and self.data.one_scene:
+        if held and self.data.one_scene and split is None:
             self.warnings.append(
                 f"one scene: {len(held)} of its {len(self.data.entries)} views are held out, so "
                 "figures are of new views of this scene, not of new scenes"
@@ -126,7 +161,8 @@ class _Trainer:
         if not self.run.checkpoint.exists():
             if self.recipe.init_from:
                 self._begin_with(Path(self.recipe.init_from))
-            self.recipe.write(self.run.recipe)
+            if not self.rank:
+                self.recipe.write(self.run.recipe)
             return 0
         begun = Recipe.read(self.run.recipe)
         if begun.changed(steps=self.recipe.steps) != self.recipe:
@@ -135,7 +171,8 @@ class _Trainer:
                 detail=f"{self.run.folder} was begun with another recipe; give the same one, or "
                 "another --out",
             )
-        self.recipe.write(self.run.recipe)  # the number of steps may be another
+        if not self.rank:
+            self.recipe.write(self.run.recipe)  # the number of steps may be another
         groups, step, optimizer = self.run.load()
         self.network.load_state_dict(groups["model"])
         self.average = {k: v.to(self.device) for k, v in groups["average"].items()}
@@ -164,12 +201,10 @@ class _Trainer:
             self.warnings.append(f"not in {folder}, so begun at random: {', '.join(fresh)}")
 
     def steps(self, stopped: Callable[[], bool]) -> Iterator[Progress]:
-        from torch.utils.tensorboard import SummaryWriter
-
         recipe, bad, smooth = self.recipe, 0, math.nan
         if self.first >= recipe.steps:
             return
-        with SummaryWriter(str(self.run.log), purge_step=self.first) as log:
+        with self._log() as log:
             if recipe.init_from and not self.first:  # what it has to beat
                 yield Progress(0, recipe.steps, math.nan, self._validate(log, 0), self._warned())
             source = batches(
@@ -196,14 +231,30 @@ class _Trainer:
                     bad = 0
                     smooth = value if math.isnan(smooth) else 0.98 * smooth + 0.02 * value
                     log.add_scalar("loss/train", value, step)
-                last = step == recipe.steps or stopped()
-                if step % VALIDATE_EVERY == 0 or step == recipe.steps:
+                last = step == recipe.steps or self._any(stopped())
+                if step % self.every.validate == 0 or step == recipe.steps:
                     figures = self._validate(log, step)
-                if step % SAVE_EVERY == 0 or last:
+                if step % self.every.save == 0 or last:
                     self._save(step)
                 yield Progress(step, recipe.steps, smooth, figures, self._warned())
                 if last:
                     break
+
+    def _log(self) -> Any:
+        """TensorBoard's writer; for other processes than the first one that writes nothing."""
+        if self.rank:
+            return _NoLog()
+        from torch.utils.tensorboard import SummaryWriter
+
+        return SummaryWriter(str(self.run.log), purge_step=self.first)
+
+    def _any(self, here: bool) -> bool:
+        """Whether it is so in any process."""
+        if self.world == 1:
+            return here
+        flag = torch.tensor(float(here))
+        distributed.all_reduce(flag, distributed.ReduceOp.MAX)
+        return bool(flag)
 
     def _warned(self) -> str:
         """The warnings since the last time."""
@@ -214,19 +265,21 @@ class _Trainer:
     def _learn(self, batch: Batch) -> tuple[float, str]:
         """One step on a batch: its loss, and what was wrong if it taught nothing."""
         recipe = self.recipe
-        gbuffer, reference = batch.gbuffer.to(self.device), batch.reference.to(self.device)
-        if not (torch.isfinite(gbuffer).all() and torch.isfinite(reference).all()):
+        gbuffer, reference = self._own(batch.gbuffer), self._own(batch.reference)
+        finite = torch.isfinite(gbuffer).all() and torch.isfinite(reference).all()
+        if self._any(not finite):
             return math.nan, "non-finite samples"
         self.shader.train()
         mixed = recipe.precision == "bf16"
-        given = [each.to(self.device) for each in batch.light]
+        given = [self._own(each) for each in batch.light]
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
-            image = self._answered(self.shader, gbuffer, given)
+            image = answered(self.shader, gbuffer, given)
         loss = self.loss(*self.shader.compared(image, reference))
         self.optimizer.zero_grad(set_to_none=True)
-        if not torch.isfinite(loss):
+        if self._any(not torch.isfinite(loss)):
             return math.nan, f"loss {float(loss)}"
         loss.backward()  # type: ignore[no-untyped-call]
+        self._share([loss.detach(), *(p.grad for p in self.network.parameters())])
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), recipe.clip or math.inf)
         if not torch.isfinite(norm):
             return math.nan, f"gradient norm {float(norm)}"
@@ -241,38 +294,30 @@ class _Trainer:
                 self.average[name].lerp_(value, 1 - decay)
         return float(loss.detach()), ""
 
-    @staticmethod
-    def _answered(shader: Shader, gbuffer: Tensor, given: Sequence[Tensor]) -> Tensor:
-        """The answer on the transfer curve, as large as the G-buffer."""
-        height, width = gbuffer.shape[2:]
-        padded = shader.padded(gbuffer)
-        image = shader.lit(padded, *given) if given else shader.on_curve(padded)
-        return image[:, :, :height, :width]
+    def _own(self, whole: Tensor) -> Tensor:
+        """This process's part of a batch, on the device."""
+        return whole.chunk(self.world)[self.rank].to(self.device)
+
+    def _share(self, tensors: Sequence[Tensor | None]) -> None:
+        """Replace each by its mean over the processes; their parts of a batch are equally large."""
+        for tensor in tensors if self.world > 1 else ():
+            if tensor is not None:
+                distributed.all_reduce(tensor)
+                tensor /= self.world
 
     def _validate(self, log: Any, step: int) -> dict[str, float]:
         """Mean DSSIM and MAE of the averaged weights, beside the trivial answer's DSSIM."""
-        effect = self.data.effect
+        if self.rank:
+            return {}
         network = build(self.recipe.network).to(self.device)
         network.load_state_dict(self.average)
-        shader = Shader(effect, network).eval()
+        shader = Shader(self.data.effect, network).eval()
         rows: list[list[float]] = []
-        pictures: list[Tensor] = []
-        for number in self.held:
-            gbuffer, light, sample = self.data.judged(number)
-            given = [each.to(self.device) for each in light]
-            with torch.inference_mode():
-                found = shader.bounded(self._answered(shader, gbuffer.to(self.device), given))
-            answer = found.cpu().flatten(0, 1).numpy()
-            reference, blank = sample[self.data.reference], sample["trivial"]
-            image, truth, nothing = (
-                torch.from_numpy(each)[None]
-                for each in judging.exposed(effect, reference, answer, reference, blank)
-            )
-            error = (image - truth).abs()
-            figures = dssim(image, truth), error.mean(), dssim(nothing, truth)
-            rows.append([float(figure) for figure in figures])
-            if len(pictures) < 6:
-                pictures.append(torch.cat([image, truth, error], 3)[0].expand(3, -1, -1))
+        shown: list[Tensor] = []
+        for found in validated(shader, self.data, self.held, self.device):
+            rows.append([found.dssim, found.mae, found.trivial_dssim])
+            if len(shown) < 6:
+                shown.append(found.picture[0].expand(3, -1, -1))
         if not rows:
             return {}
         mean = np.mean(rows, axis=0)
@@ -280,7 +325,9 @@ class _Trainer:
         summary["ratio"] = summary["dssim"] / summary["trivial_dssim"]
         for key, value in summary.items():
             log.add_scalar(f"validation/{key}", value, step)
-        log.add_image("ours, reference, error", torch.cat(pictures, 1).numpy(), step)
+        log.add_image("ours, reference, error", torch.cat(shown, 1).numpy(), step)
+        preview = pictures.of_effect(torch.cat(shown[:2], 1), self.data.effect)
+        pictures.save(self.run.preview, preview)
         history = json.loads(self.run.metrics.read_text()) if self.run.metrics.exists() else []
         history = [entry for entry in history if entry["step"] < step]
         with replacing(self.run.metrics) as temporary:
@@ -290,8 +337,30 @@ class _Trainer:
         return summary
 
     def _save(self, step: int) -> None:
+        if self.rank:
+            return
         groups = {"model": self.network.state_dict(), "average": self.average}
         self.run.save(groups, step, self.optimizer.state_dict())
+
+
+class _NoLog:
+    """What TensorBoard's writer is, but for nobody."""
+
+    def __enter__(self) -> _NoLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+    def add_scalar(self, *_: object) -> None:
+        """Write nothing."""
+
+
+def _place() -> tuple[int, int]:
+    """This process's number, and of how many, in torch's process group; (0, 1) without one."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return 0, 1
+    return distributed.get_rank(), distributed.get_world_size()
 
 
 def _device(name: str) -> torch.device:

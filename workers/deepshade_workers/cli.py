@@ -286,9 +286,17 @@ def datagen(
     layers: Annotated[
         str, typer.Option(help="More to render, commas between: do_directions.")
     ] = "",
+    augment: Annotated[
+        bool,
+        typer.Option(
+            "--augment",
+            help="Store the eight turns and mirrors of each view, for trainers that turn nothing; "
+            "ours needs it not.",
+        ),
+    ] = False,
     shard_size: Annotated[
         int | None,
-        typer.Option(help="Samples in a shard. Default: views / 16, 128 at most.", min=1),
+        typer.Option(help="Views in a shard. Default: views / 16, 128 at most.", min=1),
     ] = None,
     address: Annotated[
         str | None, typer.Option(help="A running Ray cluster. Default: one of its own.")
@@ -324,7 +332,7 @@ def datagen(
         seed=seed,
         radius=radius,
         min_contrast=min_contrast,
-        shard_size=shard_size or default_shard_size(views, out),
+        shard_size=shard_size or default_shard_size(views, out, 8 if augment else 1),
         max_blur=max_blur,
         max_motion=max_motion,
         max_scatter=max_scatter,
@@ -332,6 +340,7 @@ def datagen(
         environments=None if environments is None else str(environments),
         skies=skies,
         layers=tuple(_listed(layers)),
+        augment=augment,
     )
     warn(notes_of(spec.scenes))
     begun = time.monotonic()

@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from deepshade import symmetry
 from deepshade.effects import EFFECTS
 from deepshade.environments.stored import store, stored_path
 from deepshade.errors import ConfigError, DataError, SceneError
@@ -52,7 +53,8 @@ class DataSpec:
     each view, up to `max_blur`, `max_motion` and `max_scatter` pixels (`view.Limits`), with
     pictures from the folder `textures` among their textures. Effects under an environment get, for
     each view, a map of the folder `environments` or one of `skies` generated ones, and a rotation.
-    `layers` (`references.layer_of`) come beside the references.
+    `layers` (`references.layer_of`) come beside the references. With `augment` each view is stored
+    in all turns and mirrors that its effects have (`turns`), and `views` counts it once.
     """
 
     scenes: tuple[str, ...]
@@ -72,6 +74,7 @@ class DataSpec:
     environments: str | None = None
     skies: int = 64
     layers: tuple[str, ...] = ()
+    augment: bool = False
 
     def __post_init__(self) -> None:
         least = {"views": 1, "size": 1, "frame": self.size, "spp": 1, "seed": 0, "shard_size": 1}
@@ -91,6 +94,8 @@ class DataSpec:
         require(self.effects)
         for name in self.layers:
             layer_of(name)
+        if self.augment and self.layers:
+            raise ConfigError("augment", detail="--augment can't turn --layers: leave one out")
         if self.environments is not None:
             map_files(self.environments)
         elif self.surrounded and not self.skies:
@@ -106,6 +111,15 @@ class DataSpec:
     def samples(self, shard: int) -> range:
         """The sample numbers of a shard."""
         return range(shard * self.shard_size, min(self.views, (shard + 1) * self.shard_size))
+
+    @property
+    def turns(self) -> tuple[int, ...]:
+        """The symmetries in which a view is stored: those that all effects have."""
+        if not self.augment:
+            return (0,)
+        return tuple(
+            t for t in symmetry.ALL if all(t in EFFECTS[e].symmetries for e in self.effects)
+        )
 
     @property
     def least_contrast(self) -> float:
@@ -142,17 +156,19 @@ class DataSpec:
             found["layers"] = list(self.layers)
         else:
             del found["layers"]
+        if not self.augment:
+            del found["augment"]
         return found
 
 
-def default_shard_size(views: int, folder: Path) -> int:
+def default_shard_size(views: int, folder: Path, turns: int = 1) -> int:
     """A sixteenth of the views, so that cores share them and a kill loses little; 128 at most.
 
-    A data set that is there keeps its own.
+    Each may be stored in several `turns`. A data set that is there keeps its own.
     """
     if (folder / NAME).exists():
         return int(Manifest.read(folder).settings.get("shard_size", MAX_SHARD))
-    return max(1, min(MAX_SHARD, views // 16))
+    return max(1, min(MAX_SHARD // turns, views // 16))
 
 
 def expand_scenes(names: list[str]) -> tuple[str, ...]:
@@ -258,8 +274,9 @@ def make_shard(spec: DataSpec, index: int, folder: Path, tick: Callable[[], obje
         sample, record, view = _rendered(spec, number)
         if view.surroundings is not None:
             store(folder, view.surroundings.environment)
-        images.append({name: sample[name] for name in tensors})
-        records.append(record)
+        for turn in spec.turns:
+            images.append({name: symmetry.apply(sample[name], name, turn) for name in tensors})
+            records.append({**record, "turn": turn} if spec.augment else record)
         tick()
     return write_shard(folder, index, tensors, images, records)
 
@@ -344,7 +361,7 @@ def generate(
 def _complete(spec: DataSpec, index: int, manifest: Manifest, folder: Path) -> bool:
     return any(
         shard.file == shard_name(index)
-        and len(shard.samples) == len(spec.samples(index))
+        and len(shard.samples) == len(spec.samples(index)) * len(spec.turns)
         and (folder / shard.file).is_file()
         and sha256(folder / shard.file) == shard.sha256
         and all(

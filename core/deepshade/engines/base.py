@@ -56,6 +56,10 @@ class Engine(ABC):
     def prepare(self, height: int, width: int) -> None:  # noqa: B027 (most need nothing)
         """Compile what the first prediction of this size would have to; blocks."""
 
+    def sizes(self) -> list[tuple[int, int]]:
+        """The (height, width) that are compiled, where that is done for each."""
+        return []
+
     @abstractmethod
     def predict(self, gbuffer: Float, environment: Mapping[str, Float] | None = None) -> Float:
         """(N, C, H, W) to (N, C', H, W), H and W multiples of the bundle's size multiple.

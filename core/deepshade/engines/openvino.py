@@ -76,6 +76,11 @@ class OpenVino(Engine):
         """See `Engine.prepare`."""
         self._network((1, self.bundle.channels, height, width))
 
+    def sizes(self) -> list[tuple[int, int]]:
+        """See `Engine.sizes`."""
+        with self._lock:
+            return list(dict.fromkeys((h, w) for _, _, h, w in self._networks))
+
     def predict(self, gbuffer: Float, environment: Mapping[str, Float] | None = None) -> Float:
         """See `Engine.predict`."""
         network = self._network(gbuffer.shape)

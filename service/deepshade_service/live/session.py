@@ -12,9 +12,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+from deepshade.tokens import same
 from deepshade_service.config import Settings
 from deepshade_service.live.answer import Answer
-from deepshade_service.live.tokens import same
 from deepshade_service.live.viewer import Viewer
 from deepshade_service.problems import Problem
 

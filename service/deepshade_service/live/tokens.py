@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from starlette.requests import HTTPConnection
 
+from deepshade.tokens import same
 from deepshade_service.problems import Problem
 
 LIFE = 3600.0  # seconds that a link is good for
@@ -73,11 +74,6 @@ class Tokens:
         text = f"deepshade.live {session} {expiry}".encode()
         digest = hmac.digest((self._token or "").encode(), text, hashlib.sha256)
         return base64.urlsafe_b64encode(digest).decode().rstrip("=")
-
-
-def same(given: str, right: str) -> bool:
-    """Whether two secrets are equal, in a time that says nothing about where they differ."""
-    return hmac.compare_digest(given.encode(), right.encode())
 
 
 def presented(request: HTTPConnection) -> Sequence[str]:
