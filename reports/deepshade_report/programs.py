@@ -6,16 +6,21 @@ Each runner takes a folder of `deepshade export --to …` and gives `answer(inpu
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from deepshade.errors import DataError
+
 Float = NDArray[np.float32]
 ROW = 512  # numbers in a row of an array texture, and rows in a layer
 _NUMBERS = 256  # bytes of them a pass
+GLSLANG = "glslangValidator"
 
 
 class Runner(Protocol):
@@ -49,11 +54,6 @@ class _Program:
         found: Float = np.frombuffer(content, np.float32, int(np.prod(shape))).reshape(shape)
         return found
 
-    def groups(self, k: int) -> tuple[int, int]:
-        """How many groups of a pass start along x and y."""
-        count, across = int(self.numbers[k, 0]), int(self.numbers[k, 4])
-        return across // 64, -(-count // across)
-
 
 class GlCompute:
     """GLSL compute shaders on OpenGL 4.3, through EGL."""
@@ -79,7 +79,7 @@ class GlCompute:
             for at, buffer in enumerate((*each["reads"], each["writes"])):
                 self.buffers[buffer].bind_to_storage_buffer(at)
             self.numbers.bind_to_uniform_block(0, offset=k * _NUMBERS, size=_NUMBERS)
-            self.shaders[each["kernel"]].run(*self.program.groups(k))
+            self.shaders[each["kernel"]].run(*each["groups"])
             self.gl.memory_barrier()
         return self.program.shaped(self.buffers[self.program.told["output"]["buffer"]].read())
 
@@ -139,7 +139,7 @@ class GlFragment:
 
 
 class WebGpu:
-    """WGSL compute shaders by wgpu; or the HLSL ones, made SPIR-V by Slang."""
+    """WGSL compute shaders by wgpu."""
 
     def __init__(self, folder: Path) -> None:
         import wgpu
@@ -206,8 +206,26 @@ class WebGpu:
         for k, each in enumerate(program.passes):
             compute.set_pipeline(self.pipelines[each["kernel"]])
             compute.set_bind_group(0, self.groups[k])
-            compute.dispatch_workgroups(*program.groups(k))
+            compute.dispatch_workgroups(*each["groups"])
         compute.end()
         self.device.queue.submit([encoder.finish()])
         output = self.buffers[program.told["output"]["buffer"]]
         return program.shaped(self.device.queue.read_buffer(output))
+
+
+class Hlsl(WebGpu):
+    """The HLSL ones instead, made SPIR-V by glslang."""
+
+    def code(self, name: str) -> Any:
+        """A kernel, compiled."""
+        with TemporaryDirectory() as scratch:
+            made = Path(scratch) / "kernel.spv"
+            source = self.program.folder / f"{name}.hlsl"
+            done = subprocess.run(
+                [GLSLANG, "-D", "-V", "-S", "comp", "-e", "main", "-o", made, source],
+                capture_output=True,
+                text=True,
+            )
+            if done.returncode:
+                raise DataError(f"{source}: {done.stdout.strip()}")
+            return made.read_bytes()

@@ -11,17 +11,20 @@ import re
 from collections.abc import Callable
 from importlib.resources import files
 
-from deepshade_trainer.shaders.layers import KERNELS
+from deepshade_trainer.shaders.layers import KERNELS, SEVERAL
 
 _HERE = files(__package__)
 _WGSL = (
     (r"\bfloat (\w+)\(int (\w+)\) \{", r"fn \1(\2: i32) -> f32 {"),
+    (r"\bvoid (\w+)\(int (\w+)\) \{", r"fn \1(\2: i32) {"),
     (r"\b(int|float|bool) (\w+) =", r"var \2: \1 ="),
     (r"\bint\b", "i32"),
     (r"\bfloat\b", "f32"),
     (r"\bpick\(", "select("),
     (r"\broundEven\(", "round("),
 )
+
+_ONE = "void run(int i) {\n  if (i < p(0)) { put(i, value(i)); }\n}\n"
 
 
 def _wgsl(text: str) -> str:
@@ -54,8 +57,11 @@ def shaders(language: str) -> dict[str, str]:
     for ending, host, translate in _WAYS[language]:
         around = _read("hosts", host)
         for kernel in KERNELS:
-            text = translate(_read("kernels", f"{kernel}.txt"))
-            made[f"{kernel}.{ending}"] = around.replace("KERNEL\n", f"{text}\n")
+            text = _read("kernels", f"{kernel}.txt")
+            if host.startswith("compute"):
+                text += "\n"
+                text += _read("kernels", f"{kernel}.compute.txt") if kernel in SEVERAL else _ONE
+            made[f"{kernel}.{ending}"] = around.replace("KERNEL\n", f"{translate(text)}\n")
     return made | {name: _read("hosts", name) for name in _FURTHER.get(language, ())}
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade_trainer.shaders.program import View, walk
+from deepshade_trainer.shaders.program import Pass, View, walk
 
 if TYPE_CHECKING:
     from deepshade_trainer.shaders.lowering import Lowering, Value
@@ -221,6 +221,11 @@ def depth_to_space(low: Lowering, node: Any, given: Given, x: View) -> View:
     return low.reshaped(moved, (count, left, high * side, wide * side))
 
 
+def block(made: Pass) -> int:
+    """How many numbers an invocation of its compute shader makes."""
+    return int(made.numbers[28]) if made.kernel in SEVERAL else 1
+
+
 def _weights(value: Any) -> NDArray[Any]:
     if not isinstance(value, np.ndarray) or value.ndim != 4:
         raise ValueError("weights that are no constant of four axes")
@@ -281,3 +286,4 @@ LAYERS: dict[str, Callable[..., Any]] = {
 KERNELS: Sequence[str] = (
     "map", "conv", "deconv", "pool", "pad", "gather", "resize", "sample", "reduce", "matmul",
 )  # fmt: skip
+SEVERAL = {"conv"}  # whose compute shaders make a block of numbers in each invocation

@@ -111,13 +111,18 @@ class Pass:
         for at, value in own.items():
             numbers[at] = value if not isinstance(value, float) else bits(value)
         numbers[:4] = count, count, count, 0
-        numbers[4] = min(-(-count // GROUP), GRID) * GROUP
+        numbers[4] = GRID * GROUP
         return cls(kernel, target, tuple(sources), numbers)
 
     @property
     def count(self) -> int:
         """How many numbers it makes."""
         return int(self.numbers[0])
+
+    def groups(self, block: int = 1) -> tuple[int, int]:
+        """Along x and y, how many groups of a compute shader that makes `block` at once start."""
+        groups = -(-self.count // (block * GROUP))
+        return min(groups, GRID), -(-groups // GRID)
 
     @property
     def placed(self) -> bool:

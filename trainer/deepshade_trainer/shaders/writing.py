@@ -12,6 +12,7 @@ import numpy as np
 
 from deepshade.files import replacing
 from deepshade_trainer.shaders.languages import shaders
+from deepshade_trainer.shaders.layers import block
 from deepshade_trainer.shaders.program import NUMBERS, Program
 
 FORMAT = 1
@@ -47,7 +48,12 @@ def write_shaders(
         "buffers": program.buffers,
         "numbers": NUMBERS,
         "passes": [
-            {"kernel": each.kernel, "reads": _three(each.sources), "writes": each.target}
+            {
+                "kernel": each.kernel,
+                "reads": _three(each.sources),
+                "writes": each.target,
+                "groups": each.groups(block(each)),
+            }
             for each in program.passes
         ],
     }

@@ -12,12 +12,12 @@ float c(int i) { return data_c[i]; }
 int p(int k) { return numbers[k / 4][k % 4]; }
 float f(int k) { return intBitsToFloat(p(k)); }
 float pick(float no, float yes, bool which) { return which ? yes : no; }
+void put(int i, float found) {
+  if (p(5) == 1) { found = clamp(found, f(6), f(7)); }
+  made[p(3) + (i / p(1)) * p(2) + i % p(1)] = found;
+}
 
 KERNEL
 void main() {
-  int i = int(gl_GlobalInvocationID.x) + int(gl_GlobalInvocationID.y) * p(4);
-  if (i >= p(0)) { return; }
-  float found = value(i);
-  if (p(5) == 1) { found = clamp(found, f(6), f(7)); }
-  made[p(3) + (i / p(1)) * p(2) + i % p(1)] = found;
+  run(int(gl_GlobalInvocationID.x) + int(gl_GlobalInvocationID.y) * p(4));
 }
