@@ -132,9 +132,7 @@ class GlFragment:
             end = start + (-(-count // chunk) - 1) * pitch + chunk
             self.targets[each["writes"]].use()
             self.gl.viewport = (0, 0, ROW, min(ROW, -(-end // ROW)))
-            self.arrays[each["kernel"]].render(
-                vertices=3, instances=-(-end // ROW**2)
-            )
+            self.arrays[each["kernel"]].render(vertices=3, instances=-(-end // ROW**2))
         return program.shaped(self.textures[program.told["output"]["buffer"]].read())
 
 
@@ -176,9 +174,7 @@ class WebGpu:
             self.device.create_buffer(size=4 * max(size, 1), usage=every) for size in program.sizes
         ]
         self.device.queue.write_buffer(self.buffers[0], 0, program.weights)
-        self.numbers = self.device.create_buffer_with_data(
-            data=program.numbers, usage=use.UNIFORM
-        )
+        self.numbers = self.device.create_buffer_with_data(data=program.numbers, usage=use.UNIFORM)
         self.groups = [self._bind(k) for k in range(len(program.passes))]
 
     def code(self, name: str) -> Any:

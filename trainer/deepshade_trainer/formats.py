@@ -115,7 +115,7 @@ def _npz(bundle: Bundle, folder: Path) -> None:
     with replacing(path) as part, part.open("wb") as file:
         np.savez(file, **{"deepshade": np.array(json.dumps(document)), **weights})
     count = sum(each.size for each in weights.values())
-    typer.echo(f"{path}: {len(weights)} arrays of {count} numbers; {len(nodes)} nodes in 'deepshade'")
+    typer.echo(f"{path}: {len(weights)} arrays of {count} numbers; {len(nodes)} nodes")
 
 
 def _told(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""A graph whose convolutions are calculated in 16 bits, and nothing else that would suffer by it."""
+"""A graph whose convolutions are in 16 bits, and nothing that would suffer by it."""
 
 from __future__ import annotations
 

@@ -15,13 +15,7 @@ from typing import Any
 
 # Of the operators that our graphs may hold
 _UNITY_LACKS = {"If", "Loop", "Scan"}
-_WEBGPU = set(
-    "Abs Add AveragePool Cast Clip Concat Conv ConvTranspose DepthToSpace Div Equal Exp Expand "
-    "Floor Gather Gemm Greater GreaterOrEqual GridSample If Less LessOrEqual Log MatMul MaxPool "
-    "Mul Neg Not Pad Pow Range Reciprocal ReduceMax ReduceMean ReduceMin ReduceSum Relu Reshape "
-    "Resize Shape Sigmoid Slice Softmax Split Sqrt Squeeze Sub Tanh Tile Transpose Unsqueeze "
-    "Where".split()
-)
+_WEBGPU_LACKS = {"And", "ConstantOfShape", "Max", "Min", "Round"}
 _FLOAT16 = 10
 
 
@@ -41,8 +35,8 @@ def takers(model: Any) -> list[Taker]:
     half = any(tensor.data_type == _FLOAT16 for tensor in model.graph.initializer)
     if half:
         wrong.append("no 16-bit floats among its types")
-    slow = sorted(kinds - _WEBGPU)
-    beside = f"in WebAssembly, for WebGPU lacks them: {', '.join(slow)}" if slow else ""
+    slow = sorted(kinds & _WEBGPU_LACKS)
+    beside = f"on WebGPU but for {', '.join(slow)}, which run in WebAssembly" if slow else ""
     return [
         Taker("Unity Inference Engine", not wrong, ", ".join(dict.fromkeys(wrong))),
         Taker("Unreal NNE (NNERuntimeORT)", True),

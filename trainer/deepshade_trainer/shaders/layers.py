@@ -134,12 +134,11 @@ def gather(low: Lowering, x: View, which: View, axis: int, name: str) -> View:
 
 def resize(low: Lowering, node: Any, given: Given, x: View, *rest: Any) -> View:
     """Of another size: nearest as `asymmetric` and `floor` say, or linear by `half_pixel`."""
-    way = tuple(
-        given[key].decode() for key in ("mode", "coordinate_transformation_mode") if key in given
-    )
+    mode = given.get("mode", b"nearest").decode()
+    way = mode, given.get("coordinate_transformation_mode", b"half_pixel").decode()
     ways = {("nearest", "asymmetric"): 0, ("linear", "half_pixel"): 1}
-    if way not in ways or (way[0] == "nearest" and given.get("nearest_mode") != b"floor"):
-        raise ValueError(f"{' '.join(way)}")
+    if way not in ways or (mode == "nearest" and given.get("nearest_mode") != b"floor"):
+        raise ValueError(" ".join(way))
     scales, sizes = (*rest[1:], None, None)[:2]
     if sizes is not None and len(sizes):
         shape = [int(n) for n in sizes]
@@ -170,8 +169,8 @@ def reduce(low: Lowering, node: Any, given: Given, x: View, axes: Any = None) ->
     named = given.get("axes", axes)
     over = sorted({int(each) % rank for each in (range(rank) if named is None else named)})
     kept = [k for k in range(rank) if k not in over]
-    outer = x.turned(x.array[tuple(0 if k in over else slice(None) for k in range(rank)) + (...,)])
-    inner = x.turned(x.array[tuple(0 if k in kept else slice(None) for k in range(rank)) + (...,)])
+    outer = x.turned(x.array[(*(0 if k in over else slice(None) for k in range(rank)), ...)])
+    inner = x.turned(x.array[(*(0 if k in kept else slice(None) for k in range(rank)), ...)])
     sizes, (steps,) = walk(outer.shape, [outer])
     lengths, (strides,) = walk(inner.shape, [inner])
     if len(lengths) > _REDUCED:

@@ -70,8 +70,8 @@ class Lowering:
         if name not in self.makers or self.makers[name].placed:
             answer = self.copy(answer)
         output = Slot(name, answer.buffer, answer.shape)
-        self.buffers[WEIGHTS] = sum(each.size for each in self.weights)
         weights = np.concatenate(self.weights) if self.weights else np.zeros(1, np.float32)
+        self.buffers[WEIGHTS] = weights.size
         return Program(inputs, output, self.buffers, self.passes, weights)
 
     def node(self, node: Any) -> None:
@@ -89,7 +89,9 @@ class Lowering:
                 made = self.handler(node)(node, given, *inputs)
             except ValueError as error:
                 raise DataError(f"{node.op_type} {node.output[0]}: {error}") from error
-        for name, value in zip(node.output, made if isinstance(made, list) else [made], strict=True):
+        for name, value in zip(
+            node.output, made if isinstance(made, list) else [made], strict=True
+        ):
             self.values[name] = value
 
     def handler(self, node: Any) -> Callable[..., Any]:

@@ -56,7 +56,9 @@ class View:
     @property
     def strides(self) -> tuple[int, ...]:
         """How many numbers lie between neighbours along each axis."""
-        return tuple(0 if n == 1 else s for n, s in zip(self.shape, self.array.strides, strict=True))
+        return tuple(
+            0 if n == 1 else s for n, s in zip(self.shape, self.array.strides, strict=True)
+        )
 
     @property
     def offset(self) -> int:
