@@ -157,26 +157,38 @@ def export(
         float, typer.Option(help="Effect radius where a picture has no depth, scene units.")
     ] = 1.0,
     note: Annotated[Path | None, typer.Option(help="Text that ends the model card.")] = None,
-    to: Annotated[str, typer.Option(help="'onnx': a bundle's graph for another program.")] = "",
+    to: Annotated[
+        str, typer.Option(help="A bundle for another program: onnx, glsl, wgsl, hlsl or npz.")
+    ] = "",
     size: Annotated[
         str, typer.Option(help="With --to: WxH in pixels, such as 768x512, or dynamic.")
     ] = "dynamic",
-    opset: Annotated[int, typer.Option(help="With --to: ONNX opset, 13 to 18.")] = 18,
+    opset: Annotated[int, typer.Option(help="With --to onnx: opset, 13 to 18.")] = 18,
+    precision: Annotated[str, typer.Option(help="With --to onnx: fp32 or fp16.")] = "fp32",
+    apart: Annotated[
+        bool, typer.Option("--apart", help="With --to onnx: an input for each attribute.")
+    ] = False,
 ) -> None:
     """Write a bundle, prove that ONNX Runtime equals torch, and measure it for its card.
 
     deepshade export runs/ao --out models/ao/balanced --data data/ao --test data/test
 
-    With --to, write a bundle's graph for a program of your own instead (docs/onnx.md):
+    With --to, write a bundle for a program of your own instead: a graph (docs/onnx.md), shaders
+    (docs/shaders.md) or weights:
 
     deepshade export models/ao/fast --to onnx --size 768x512 -o graphs
+
+    deepshade export models/ao/fast --to glsl --size 768x512 -o shaders
     """
     from functools import partial
 
     from deepshade.errors import ConfigError
 
     if to:
-        _export_to(run, to, out, size, opset)
+        from deepshade.bundles import Bundle
+        from deepshade_trainer.formats import export_to
+
+        export_to(Bundle.load(run), to, out, size, opset, precision, apart)
         return
     if not data:
         raise ConfigError("data", detail="name the data that it was trained on: --data data/ao")
@@ -197,26 +209,6 @@ def export(
         write_card(measure(bundle, test, tell), Run(run), ending)
     else:
         typer.echo("not measured, as its card says: --test names views that it wasn't trained on")
-
-
-def _export_to(path: Path, to: str, folder: Path, size: str, opset: int) -> None:
-    """Write the bundle's graph to `folder` and say what it is made of."""
-    from deepshade.bundles import Bundle
-    from deepshade.errors import ConfigError
-    from deepshade_trainer.interchange import write_plain
-
-    if to != "onnx":
-        raise ConfigError("to", ["onnx"], detail=f"--to {to}: what there is is onnx")
-    width, _, height = size.partition("x")
-    if size != "dynamic" and not (width.isdecimal() and height.isdecimal()):
-        raise ConfigError("size", detail=f"--size {size}: give WxH, such as 768x512, or dynamic")
-    sides = None if size == "dynamic" else (int(width), int(height))
-    made = write_plain(Bundle.load(path), folder, sides, opset)
-    typer.echo(
-        f"{made.path}: {sum(made.operators.values())} nodes of {len(made.operators)} kinds, opset "
-        f"{opset}; ONNX Runtime's answers are within {made.difference:.0e} of the bundle's"
-    )
-    typer.echo(", ".join(f"{count} {name}" for name, count in made.operators.most_common()))
 
 
 def _parse(settings: list[str]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,64 +20,99 @@ from deepshade.effects import EFFECTS
 from deepshade.environments import Prepared, sky
 from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing
-from deepshade.tensors import up
+from deepshade.tensors import channel_slices, up
+from deepshade_trainer.dialects import easier, take_apart
 from deepshade_trainer.graph import fold, session
+from deepshade_trainer.half import halve
+from deepshade_trainer.takers import Taker, takers
 
 OPSETS = range(13, 19)
 LICENCE = "Apache-2.0"
-TOLERANCE = 1e-6  # between the graph and the bundle's own, of values up to 1, or of the value
+# between the graph and the bundle's own, of values up to 1, or of the value
+TOLERANCES = {"fp32": 1e-6, "fp16": 0.02}
 _FREE_SIDE = 128  # of the picture that a graph of any size is compared on
 
 Size = tuple[int, int]  # width, height
+Precision = Literal["fp32", "fp16"]
 
 
 @dataclass(frozen=True, slots=True)
 class Plain:
-    """A graph that was written: its operators with how often each is there, and how far ONNX
-    Runtime's answers by it lie from those by the bundle's own."""
+    """A graph that was written: its operators with how often each is there, how far ONNX
+    Runtime's answers by it lie from those by the bundle's own, and which engines take it."""
 
     path: Path
     operators: Counter[str]
     difference: float
+    takers: list[Taker]
 
 
-def write_plain(bundle: Bundle, folder: Path, size: Size | None = None, opset: int = 18) -> Plain:
-    """Write a bundle's graph to `folder`/<effect>-<name>[-WxH].onnx.
+def write_plain(
+    bundle: Bundle,
+    folder: Path,
+    size: Size | None = None,
+    opset: int = 18,
+    precision: Precision = "fp32",
+    apart: bool = False,
+) -> Plain:
+    """Write a bundle's graph to `folder`/<effect>-<name>[-WxH][-fp16].onnx.
 
     With a `size` in pixels no arithmetic on shapes is left in it, and the batch is 1; without,
     height and width are free. What one has to know to run it (`facts`) is in its metadata. Weights
-    and the names of tensors are the bundle's.
+    and the names of tensors are the bundle's. With the `precision` fp16 convolutions are in 16
+    bits (`halve`); `apart`, each attribute is an input of its own, of at most three channels.
 
-    Raises ConfigError: the size is no multiple of what the network folds, or `opset` lacks an
-    operator; DataError: ONNX Runtime gives another answer than by the bundle's own graph.
+    Raises ConfigError: the size is no multiple of what the network folds, `opset` lacks an
+    operator, or nothing of it may be fp16; DataError: ONNX Runtime gives another answer than by
+    the bundle's own graph.
     """
     import onnx
 
-    _check(bundle, size, opset)
-    stem = f"{bundle.effect}-{bundle.name}" + (f"-{size[0]}x{size[1]}" if size else "")
-    path = folder / f"{stem}.onnx"
+    check_size(bundle, size)
+    if opset not in OPSETS:
+        raise ConfigError(
+            "opset", detail=f"--opset {opset}: choose one from {OPSETS[0]} to {OPSETS[-1]}"
+        )
+    ending = (f"-{size[0]}x{size[1]}" if size else "") + ("-fp16" if precision == "fp16" else "")
+    path = folder / f"{bundle.effect}-{bundle.name}{ending}.onnx"
     folder.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        model = plain(bundle, size)
+        if precision == "fp16":
+            halve(model, bundle)
+        if apart:
+            take_apart(model, bundle)
+        _set_opset(model, opset)
+        onnx.helper.set_model_props(model, facts(bundle))
+        onnx.save(model, str(temporary))
+        difference = _difference(bundle, temporary, size)
+        if not difference <= TOLERANCES[precision]:
+            raise DataError(
+                f"by the graph made of {bundle.model} ONNX Runtime's answer differs by "
+                f"{difference:.1e}, over {TOLERANCES[precision]:.0e}"
+            )
+    operators = Counter(node.op_type for node in model.graph.node)
+    return Plain(path, operators, difference, takers(model))
+
+
+def plain(bundle: Bundle, size: Size | None = None) -> Any:
+    """A bundle's graph without `If`, and for a `size` without arithmetic on shapes; see
+    `write_plain`. Operators are used only in ways that engines know (`easier`).
+    """
+    import onnx
+
     model = onnx.load(str(bundle.model))
     if size is not None:
         picture = model.graph.input[0].type.tensor_type.shape.dim
         for axis, value in ((0, 1), (2, size[1]), (3, size[0])):
             picture[axis].dim_value = value
     _shape_output(model, bundle)
-    with TemporaryDirectory() as scratch, replacing(path) as temporary:
+    with TemporaryDirectory() as scratch:
         raw = Path(scratch) / "raw.onnx"
         onnx.save(model, str(raw))
-        model = fold(raw, temporary)
-        del model.graph.value_info[:]
-        _set_opset(model, opset)
-        onnx.helper.set_model_props(model, facts(bundle))
-        onnx.save(model, str(temporary))
-        difference = _difference(bundle, temporary, size)
-        if not difference <= TOLERANCE:
-            raise DataError(
-                f"by the graph made of {bundle.model} ONNX Runtime's answer differs by "
-                f"{difference:.1e}, over {TOLERANCE:.0e}"
-            )
-    return Plain(path, Counter(node.op_type for node in model.graph.node), difference)
+        model = fold(raw, Path(scratch) / "folded.onnx")
+    del model.graph.value_info[:]
+    return easier(model)
 
 
 def facts(bundle: Bundle) -> dict[str, str]:
@@ -115,11 +150,8 @@ def channels(bundle: Bundle) -> list[str]:
 _DIVISORS = {"radius": "the effect's radius", "depth": "the median depth of the picture's surfaces"}
 
 
-def _check(bundle: Bundle, size: Size | None, opset: int) -> None:
-    if opset not in OPSETS:
-        raise ConfigError(
-            "opset", detail=f"--opset {opset}: choose one from {OPSETS[0]} to {OPSETS[-1]}"
-        )
+def check_size(bundle: Bundle, size: Size | None) -> None:
+    """Raise ConfigError unless the network takes pictures of a size."""
     multiple = bundle.size_multiple
     if size and (min(size) < 1 or size[0] % multiple or size[1] % multiple):
         width, height = (up(max(1, side), multiple) for side in size)
@@ -178,7 +210,10 @@ def _difference(bundle: Bundle, path: Path, size: Size | None) -> float:
     """Largest difference of ONNX Runtime's answers by the two graphs, of values over 1 relative."""
     side = up(_FREE_SIDE, bundle.size_multiple)
     width, height = size or (side + bundle.size_multiple, side)
-    given = {bundle.input_name: noise(bundle, height, width)[:1]}
+    picture = noise(bundle, height, width)[:1]
+    given = {bundle.input_name: picture}
+    places = channel_slices(bundle.inputs, bundle.per_channel)
+    given |= {name: picture[:, place] for name, place in places.items()}
     if bundle.environment:
         prepared = Prepared.of(sky(height=64))
         given |= prepared.inputs(bundle.environment, 30.0, "y", lambda: np.eye(3))
@@ -188,5 +223,8 @@ def _difference(bundle: Bundle, path: Path, size: Size | None) -> float:
 
 
 def _answer(graph: Path, given: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-    answer: NDArray[np.float32] = session(graph).run(None, dict(given))[0]
+    """By a graph that takes some of what is given."""
+    running = session(graph)
+    feed = {entry.name: given[entry.name] for entry in running.get_inputs()}
+    answer: NDArray[np.float32] = running.run(None, feed)[0]
     return answer
