@@ -105,6 +105,10 @@ def test_schema_and_pages(client):
         "derive",
         "strict",
         "trust",
+        "view",
+        "projection",
+        "ortho_width",
+        "upload",
     }
     assert names == wanted
     assert {"image/x-exr", "multipart/form-data"} <= set(post["requestBody"]["content"])

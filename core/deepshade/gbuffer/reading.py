@@ -37,9 +37,9 @@ def fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str]
     bodies: list[Body] = []
     total = 0
     for source in sources:
-        name = source[0] if isinstance(source, tuple) else source
-        stems.append("" if isinstance(name, bytes) else Path(name).stem)
-        bodies.append(source[1] if isinstance(source, tuple) else exr.fetch(source, limits))
+        named = source if isinstance(source, tuple) else (source, exr.fetch(source, limits))
+        stems.append("" if isinstance(named[0], bytes) else Path(named[0]).stem)
+        bodies.append(named[1])
         total += len(bodies[-1])
         limits.check("body_bytes", total)
     if not bodies:
