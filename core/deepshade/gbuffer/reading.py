@@ -36,7 +36,7 @@ def fetch(sources: Source | Sequence[Source], limits: Limits) -> tuple[list[str]
     stems: list[str] = []
     bodies: list[Body] = []
     total = 0
-    for source in sources:
+    for source in cast(Sequence[Source], sources):
         named = source if isinstance(source, tuple) else (source, exr.fetch(source, limits))
         stems.append("" if isinstance(named[0], bytes) else Path(named[0]).stem)
         bodies.append(named[1])
