@@ -10,8 +10,9 @@ import torch
 
 from deepshade_trainer.run import Run
 from deepshade_trainer.tuning.distributed import train_together
-from deepshade_trainer.tuning.finetune import base_recipe, own_parts, training
+from deepshade_trainer.tuning.finetune import base_recipe
 from deepshade_trainer.tuning.plan import Plan
+from deepshade_trainer.tuning.steps import own_parts, training
 
 pytest.importorskip("pandas", reason="Ray Train isn't installed: the extra 'cluster'")
 

@@ -20,10 +20,11 @@ from deepshade.manifest import Manifest
 from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.run import Run
 from deepshade_trainer.tuning import events, shipped
-from deepshade_trainer.tuning.finetune import finetune, own_parts
+from deepshade_trainer.tuning.finetune import finetune
 from deepshade_trainer.tuning.finished import candidate
 from deepshade_trainer.tuning.parts import Parts
 from deepshade_trainer.tuning.plan import Plan
+from deepshade_trainer.tuning.steps import own_parts
 from deepshade_trainer.tuning.verdict import FILE, Paired, Verdict
 
 from .conftest import write_data

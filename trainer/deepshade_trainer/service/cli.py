@@ -84,6 +84,8 @@ def serve(
 
       deepshade-trainer serve --data /projects/shots --service http://127.0.0.1:8000
 
+      deepshade trainer --data /projects/shots   # the same program
+
       deepshade serve --models trainer/models --models shipped   # what serves the results
     """
     from deepshade.bundles import bundle_roots

@@ -16,6 +16,7 @@ from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
 from deepshade_trainer.tuning.events import EventLog, read_events
 from deepshade_trainer.tuning.plan import Plan
+from deepshade_trainer.tuning.steps import own_parts, training
 
 FAILURES = 3  # of processes that are borne
 POLL = 0.5  # seconds
@@ -67,8 +68,8 @@ def train_together(plan: Plan, recipe: Recipe, run: Run) -> Iterator[dict[str, A
                 if ended:
                     break
                 time.sleep(POLL)
-        if (error := fitted.exception()) is not None:
-            raise DataError(f"Ray Train gave up: {error}") from error
+        if (failure := fitted.exception()) is not None:
+            raise DataError(f"Ray Train gave up: {failure}") from failure
     finally:
         ray.shutdown()
 
@@ -77,8 +78,6 @@ def _loop(config: dict[str, Any]) -> None:
     """What each process does."""
     import torch
     from torch import distributed
-
-    from deepshade_trainer.tuning.finetune import own_parts, training
 
     lists = {name: tuple(config["plan"][name]) for name in ("data", "rehearsal", "test")}
     plan = Plan(**{**config["plan"], **lists})

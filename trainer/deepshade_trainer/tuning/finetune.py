@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -34,19 +33,18 @@ from deepshade_trainer.networks import Shader, build, bundle_weights
 from deepshade_trainer.networks.openings import Openings
 from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run, Tensors
-from deepshade_trainer.training import Every, Progress, train
+from deepshade_trainer.training import train
 from deepshade_trainer.tuning import shipped
+from deepshade_trainer.tuning.distributed import train_together
 from deepshade_trainer.tuning.finished import candidate
 from deepshade_trainer.tuning.parts import MIN_JUDGES, Parts
 from deepshade_trainer.tuning.plan import Plan, code, digest
+from deepshade_trainer.tuning.steps import Event, dataset_of, folders_of, own_parts, training
 from deepshade_trainer.tuning.verdict import FILE, Paired, Verdict
 from deepshade_trainer.validation import validated
 
-Event = dict[str, Any]
-
 RATE = 4e-4  # of a preset's learning rate of 2e-3: what a base knows is kept, and yet it moves
 EMA = 0.95
-VALIDATIONS, SAVES = 12, 25  # in a job, at most about
 PILOT = 4  # steps, of which the first is not timed
 USED = 0.85  # of the minutes are steps; the rest is for validation and saving
 # How far from the base to the tuned weights, the farthest first, and how much of what a test may
@@ -70,8 +68,6 @@ def finetune(plan: Plan, folder: Path) -> Iterator[Event]:
     recipe = yield from _recipe(plan, folder)
     run = Run(folder / "run")
     if plan.processes > 1:
-        from deepshade_trainer.tuning.distributed import train_together
-
         yield from train_together(plan, recipe, run)
     else:
         yield from training(plan, recipe, run, parts)
@@ -97,40 +93,6 @@ def finetune(plan: Plan, folder: Path) -> Iterator[Event]:
     with replacing(written) as temporary:
         temporary.write_text(json.dumps(decision, indent=2, allow_nan=False) + "\n", "utf-8")
     yield {"phase": "judged", "decision": decision}
-
-
-def own_parts(plan: Plan) -> Parts:
-    """Which of a job's views are for what."""
-    return Parts.of(_data(plan), plan.data, plan.seed)
-
-
-def training(plan: Plan, recipe: Recipe, run: Run, parts: Parts) -> Iterator[Event]:
-    """The steps, each as an event, with time left and, now and then, a validation."""
-    every = Every(_share(recipe.steps, SAVES), _share(recipe.steps, VALIDATIONS))
-    begun, first = 0.0, 0  # of the first step that is timed
-    steps = train(recipe, _folders(plan), run, split=_split(plan, parts), every=every)
-    for progress in steps:
-        if progress.step and not first:
-            begun, first = time.monotonic(), progress.step
-        yield _event(progress, time.monotonic() - begun, first)
-
-
-def _event(progress: Progress, seconds: float, first: int) -> Event:
-    done = progress.step - first
-    rate = done / seconds if first and done else None
-    event: Event = {
-        "phase": "training",
-        "step": progress.step,
-        "steps": progress.steps,
-        "loss": progress.loss if math.isfinite(progress.loss) else None,
-        "rate": rate,
-        "left": (progress.steps - progress.step) / rate if rate else None,
-    }
-    if progress.figures:
-        event |= {"validation": progress.figures, "preview": True}
-    if progress.warning:
-        event["warning"] = progress.warning
-    return event
 
 
 def _recipe(plan: Plan, folder: Path) -> Any:
@@ -173,7 +135,10 @@ def _pilot(plan: Plan, recipe: Recipe) -> float:
     with TemporaryDirectory() as scratch:
         short = recipe.changed(steps=PILOT, warmup=1)
         for progress in train(
-            short, _folders(plan), Run(Path(scratch)), split=lambda _: (parts.mixed(plan.share), [])
+            short,
+            folders_of(plan),
+            Run(Path(scratch)),
+            split=lambda _: (parts.mixed(plan.share), []),
         ):
             if progress.step:
                 times.append(time.monotonic())
@@ -198,9 +163,9 @@ def _blend(plan: Plan, recipe: Recipe, run: Run, parts: Parts, folder: Path) -> 
                 f"fine-tuning {plan.effect} needs older views to rehearse",
                 fix="give the trainer a library with rehearsal views: see docs/trainer.md",
             )
-        data, numbers = Lit(_folders(plan), plan.effect), parts.reminders
+        data, numbers = Lit(folders_of(plan), plan.effect), parts.reminders
     elif parts.reminders:
-        data, numbers = _data(plan), parts.reminders
+        data, numbers = dataset_of(plan), parts.reminders
     else:
         folders = [path for group in _tests(plan, folder).values() for path in group]
         data = Dataset(folders, plan.effect, per_channel=_shader(recipe, start).per_channel)
@@ -244,7 +209,7 @@ def _export(plan: Plan, folder: Path) -> Bundle:
     base, blended = Bundle.load(Path(plan.base)), Run(folder / "blended")
     path = candidate(folder, plan)
     shutil.rmtree(path, ignore_errors=True)  # of a job that was killed while it wrote
-    export(blended, path, _folders(plan), radius=base.radius, fov=base.fov)
+    export(blended, path, folders_of(plan), radius=base.radius, fov=base.fov)
     tests = [each for group in _tests(plan, folder).values() for each in group]
     bundle = card.measure(Bundle.load(path), tests)
     own = ", ".join(sorted({str(entry.record["scene"]) for entry in _own(plan).entries})[:20])
@@ -255,7 +220,7 @@ def _export(plan: Plan, folder: Path) -> Bundle:
 
 def _judge(plan: Plan, bundle: Bundle, parts: Parts, folder: Path) -> Verdict:
     base = Bundle.load(Path(plan.base))
-    own = _pair(base, bundle, _folders(plan), parts.judges)
+    own = _pair(base, bundle, folders_of(plan), parts.judges)
     if own is None or own.views < MIN_JUDGES:
         seen = own.views if own else 0
         raise DataError(
@@ -317,23 +282,6 @@ def _no_test(plan: Plan) -> DataError:
 
 def _own(plan: Plan) -> Dataset:
     return Dataset([Path(each) for each in plan.data], plan.effect)
-
-
-def _data(plan: Plan) -> Dataset:
-    per_channel = bool(Bundle.load(Path(plan.base)).per_channel)
-    return Dataset(_folders(plan), plan.effect, per_channel=per_channel)
-
-
-def _folders(plan: Plan) -> list[Path]:
-    return [Path(each) for each in (*plan.data, *plan.rehearsal)]
-
-
-def _split(plan: Plan, parts: Parts) -> Any:
-    return lambda _: (parts.mixed(plan.share), parts.judges)
-
-
-def _share(steps: int, count: int) -> int:
-    return max(1, round(steps / count))
 
 
 _PLACES = ("base", "data", "rehearsal", "test")
