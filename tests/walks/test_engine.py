@@ -18,16 +18,15 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.slow
 @pytest.mark.usefixtures("outside")
 def test_the_commands_run_the_network_without_deepshade(
-    wheel: Path, environment: Callable[..., Path], tmp_path: Path
+    installed: Path, environment: Callable[..., Path], tmp_path: Path
 ) -> None:
-    bin = environment(tmp_path / "env", "deepshade[service]", "onnx", wheel=wheel)
-    (shipped,) = bin.parent.glob("lib/python*/site-packages/deepshade/shipped")
+    (shipped,) = installed.parent.glob("lib/python*/site-packages/deepshade/shipped")
     for name in ("models", "samples"):
         (tmp_path / name).symlink_to(shipped / name)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     environment(tmp_path / "engine", "onnxruntime", "numpy", "OpenEXR")  # no network for pip
     done = subprocess.run(
-        [bin / "python", "examples/engine.py"], cwd=tmp_path, capture_output=True, text=True
+        [installed / "python", "examples/engine.py"], cwd=tmp_path, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert not list((tmp_path / "engine").glob("lib/python*/site-packages/deepshade*"))
