@@ -37,3 +37,7 @@ def test_the_commands_run_the_network_without_deepshade(
     if shutil.which("g++"):
         planes = np.fromfile(tmp_path / "shade.f32", np.float32).reshape(shade.shape)
         np.testing.assert_allclose(planes, shade, atol=1e-5)
+        run = [tmp_path / "shade_openvino", tmp_path / "models/ao/fast/model.onnx", "512", "384"]
+        short = subprocess.run(run, input=b"none", capture_output=True)
+        assert short.returncode == 1
+        assert f"fewer than {6 * 4 * shade.size} bytes" in short.stderr.decode()
