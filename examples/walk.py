@@ -64,6 +64,8 @@ def run(*blocks: str, folder: Path | None = None, log: IO[str] | None = None) ->
             command = shlex.join([word for word in words if word != "&"])
             script += f"{command} --port {port} --log-level warning & service=$!\n"
             script += "trap 'kill $service; wait $service || :' EXIT\n"
+            script += f"until : 2>/dev/null </dev/tcp/127.0.0.1/{port}; do\n"  # it is serving
+            script += "kill -0 $service; sleep 0.2; done\n"
         else:
             script += f"{line.replace(ADDRESS, f'127.0.0.1:{port}')}\n"
         script += "took\n"
