@@ -19,7 +19,8 @@ from deepshade import exr
 
 ROOT = Path(__file__).parents[2]
 EXR = {"Content-Type": "image/x-exr"}
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("home")]
+# seconds, but what starts so many programs waits long where others compute
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), pytest.mark.usefixtures("home")]
 
 
 @pytest.fixture(scope="module")

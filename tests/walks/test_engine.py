@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.usefixtures("outside")
 def test_the_commands_run_the_network_without_deepshade(
     installed: Path, environment: Callable[..., Path], tmp_path: Path
