@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import IO
 
 DOCS = Path(__file__).resolve().parent.parent
 ADDRESS = "127.0.0.1:8000"  # of the service, in the documents
@@ -47,10 +48,11 @@ def lines(shell: str) -> list[str]:
     return [line for line in joined if line and not line.startswith("#")]
 
 
-def run(*blocks: str, folder: Path | None = None) -> int:
+def run(*blocks: str, folder: Path | None = None, log: IO[str] | None = None) -> int:
     """Run shell blocks in `folder`, in one shell; the exit code is that of the first that fails.
 
-    A service that they start goes on to the end, at a free port in place of 8000.
+    A service that they start goes on to the end, at a free port in place of 8000. `log` gets what
+    they print, in place of this program's own output.
     """
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -62,10 +64,13 @@ def run(*blocks: str, folder: Path | None = None) -> int:
             command = shlex.join([word for word in words if word != "&"])
             script += f"{command} --port {port} --log-level warning & service=$!\n"
             script += "trap 'kill $service; wait $service || :' EXIT\n"
+            script += f"until : 2>/dev/null </dev/tcp/127.0.0.1/{port}; do\n"  # it is serving
+            script += "kill -0 $service; sleep 0.2; done\n"
         else:
             script += f"{line.replace(ADDRESS, f'127.0.0.1:{port}')}\n"
         script += "took\n"
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     env = {**os.environ, "PATH": path, "DEEPSHADE_SERVER": f"http://127.0.0.1:{port}"}
     sys.stdout.flush()
-    return subprocess.run(["bash", "-c", script], cwd=folder, env=env).returncode
+    command = ["bash", "-c", script]
+    return subprocess.run(command, cwd=folder, env=env, stdout=log, stderr=log).returncode

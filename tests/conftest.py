@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import venv
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import Any
@@ -77,10 +77,20 @@ def environment() -> Callable[..., Path]:
             (site / place.name).symlink_to(place)
         if wheel:
             pip = [sys.executable, "-m", "pip", "--python", str(folder), "install", "-q"]
-            subprocess.run([*pip, "--no-index", str(wheel)], check=True)
+            subprocess.run([*pip, "--no-index", "--no-compile", str(wheel)], check=True)
         return folder / "bin"
 
     return make
+
+
+@pytest.fixture(scope="session")
+def installed(made_once: Path, wheel: Path, environment: Callable[..., Path]) -> Path:
+    """The commands of an environment with the wheel and all that deepshade[all] requires."""
+    folder = made_once / "installed"
+    with FileLock(made_once / "installed.lock"):
+        if not folder.exists():
+            environment(folder, "deepshade[all]", wheel=wheel)
+    return folder / "bin"
 
 
 def _places(packages: tuple[str, ...]) -> set[Path]:
@@ -113,11 +123,13 @@ def walk() -> Any:
     return module
 
 
-@pytest.fixture
-def outside(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def outside() -> Iterator[None]:
     """No variable leads to the repository, or pip to the network."""
-    for name in list(os.environ):
-        if re.fullmatch(r"PYTHONPATH|VIRTUAL_ENV|RAY_ADDRESS|(DEEPSHADE|PIP)_.*", name):
-            monkeypatch.delenv(name)
-    monkeypatch.setenv("PIP_NO_INDEX", "1")
-    monkeypatch.setenv("PIP_DISABLE_PIP_VERSION_CHECK", "1")
+    with pytest.MonkeyPatch.context() as patch:
+        for name in list(os.environ):
+            if re.fullmatch(r"PYTHONPATH|VIRTUAL_ENV|RAY_ADDRESS|(DEEPSHADE|PIP)_.*", name):
+                patch.delenv(name)
+        patch.setenv("PIP_NO_INDEX", "1")
+        patch.setenv("PIP_DISABLE_PIP_VERSION_CHECK", "1")
+        yield

@@ -6,9 +6,10 @@ import hashlib
 import json
 import platform
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
-from importlib.metadata import distributions
+from functools import cache, cached_property
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -110,9 +111,13 @@ class Context:
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
 
+@cache
 def machine() -> dict[str, Any]:
     """The machine and what runs on it, by name and version."""
-    versions = {found.name: found.version for found in distributions() if found.name in _PACKAGES}
+    versions: dict[str, str] = {}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
     return {
         "processor": describe(),
         "memory_gib": round(memory_bytes() / 2**30, 1),

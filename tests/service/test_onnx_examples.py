@@ -78,12 +78,6 @@ def test_a_program_of_20_lines_gives_the_services_answer(
     np.testing.assert_allclose(planes(target.read_bytes(), effect), answer, atol=1e-5)
 
 
-def library(package, pattern):
-    """A shared library in a package that pip installed."""
-    files = [str(file.locate()) for file in distribution(package).files or ()]
-    return next((Path(file) for file in files if Path(file).match(pattern)), None)
-
-
 def headers_of_onnxruntime():
     """The folder with ONNX Runtime's C++ headers; its package for Python has none."""
     named = os.environ.get("ONNXRUNTIME_INCLUDE")
@@ -91,33 +85,24 @@ def headers_of_onnxruntime():
     return next((p for p in map(Path, places) if (p / "onnxruntime_cxx_api.h").exists()), None)
 
 
-def sdk(program):
-    """(folder of headers, library) for a program; skips where there is none."""
-    if program == "shade_openvino.cpp":
-        found = library("openvino", "libs/libopenvino.so.*")
-        include = found and found.parents[1] / "include"
-    else:
-        found, include = (
-            library("onnxruntime", "capi/libonnxruntime.so.*"),
-            headers_of_onnxruntime(),
-        )
-        if include is None:
-            pytest.skip("no onnxruntime_cxx_api.h: name its folder in ONNXRUNTIME_INCLUDE")
-    if found is None or not include.is_dir():
-        pytest.skip(f"no shared library with headers for {program} on this system")
-    return include, found
-
-
-@pytest.mark.parametrize("program", ["shade.cpp", "shade_openvino.cpp"])
-def test_cpp_gives_the_services_answer(program, served, shot, tmp_path):
+def test_cpp_gives_the_services_answer(served, shot, tmp_path):
+    """`tests/walks/test_engine.py` has OpenVINO's."""
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         pytest.skip("no C++ compiler")
-    include, found = sdk(program)
+    include = headers_of_onnxruntime()
+    if include is None:
+        pytest.skip("no onnxruntime_cxx_api.h: name its folder in ONNXRUNTIME_INCLUDE")
+    files = [str(file.locate()) for file in distribution("onnxruntime").files or ()]
+    found = next(
+        (Path(file) for file in files if Path(file).match("capi/libonnxruntime.so.*")), None
+    )
+    if found is None:
+        pytest.skip("no shared library of ONNX Runtime on this system")
     # a package has the library by its full version alone, programs ask for its first number
     (tmp_path / ".".join(found.name.split(".")[:3])).symlink_to(found)
     options = ["-std=c++17", "-Wall", "-Werror", f"-Wl,-rpath,{found.parent}:{tmp_path}"]
-    sources = ["-isystem", include, EXAMPLES / program, found, "-o", tmp_path / "shade"]
+    sources = ["-isystem", include, EXAMPLES / "shade.cpp", found, "-o", tmp_path / "shade"]
     built = subprocess.run([compiler, *options, *sources], capture_output=True, text=True)
     assert built.returncode == 0, built.stderr[:2000]
     bundle = Bundle.load(ROOT / "models" / "ao" / "fast")

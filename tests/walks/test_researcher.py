@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 import jsonschema
@@ -19,12 +18,9 @@ ROOT = Path(__file__).parents[2]
 @pytest.mark.slow
 @pytest.mark.timeout(900)  # about a minute of one core; Ray, Mitsuba and PyTorch start in it
 @pytest.mark.usefixtures("outside")
-def test_the_commands_make_a_shader(
-    wheel: Path, environment: Callable[..., Path], tmp_path: Path
-) -> None:
-    bin = environment(tmp_path / "env", "deepshade[all]", wheel=wheel)
+def test_the_commands_make_a_shader(installed: Path, tmp_path: Path) -> None:
     shutil.copytree(ROOT / "models/ao/fast", tmp_path / "models/ao/fast")
-    command = [bin / "python", ROOT / "examples" / "researcher.py", "--small"]
+    command = [installed / "python", ROOT / "examples" / "researcher.py", "--small"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert done.stdout.count("$ deepshade") >= 8
