@@ -22,7 +22,7 @@ from deepshade.gbuffer.views import Views
 
 MARKERS = ("depth", "distance", "alpha")  # read, where there, to know the background
 
-_RAYS = {"orthographic": "the width of the frame", "latlong": "the rays of a panorama"}
+_RAYS = {"orthographic": "the width of the frame", "latlong": "a panorama's field of view"}
 ABSENT = "not there"  # why an attribute can't be had, when nothing would make it derivable
 
 
