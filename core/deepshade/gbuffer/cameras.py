@@ -73,10 +73,14 @@ def see(
         if facts.get("envmap", LATLONG) != LATLONG:
             plan.unusable["fov"] = "the header's envmap is a cube, which isn't read"
         return
-    wide = {"fov": lens.width} if lens.projection == "perspective" else {}
-    if lens.projection == "orthographic":
-        wide = {"across": lens.width}
-    plan.camera = Camera.framed(facts, *windows, plan.matrix, projection=lens.projection, **wide)
+    plan.camera = Camera.framed(
+        facts,
+        *windows,
+        plan.matrix,
+        projection=lens.projection,
+        fov=lens.width if lens.projection == "perspective" else 0.0,
+        across=lens.width if lens.projection == "orthographic" else 0.0,
+    )
 
 
 def _matrix(attributes: Mapping[str, Any], profile: Profile | None) -> NDArray[np.float64] | None:

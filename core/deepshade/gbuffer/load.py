@@ -17,8 +17,9 @@ from deepshade.exr import Header, Limits
 from deepshade.exr.entries import Entry
 from deepshade.gbuffer import background, channels, derivation, directions
 from deepshade.gbuffer.cameras import framed
-from deepshade.gbuffer.checks import Verdict, examine
+from deepshade.gbuffer.checks import examine
 from deepshade.gbuffer.conventions import Conventions, apply
+from deepshade.gbuffer.examination import Verdict
 from deepshade.gbuffer.gbuffer import GBuffer
 from deepshade.gbuffer.guesses import suggestion
 from deepshade.gbuffer.lenses import number
