@@ -256,6 +256,8 @@ def _checks(plan: Plan, sources: Sequence[tuple[str, bytes]], **how: Any) -> dic
     from deepshade.gbuffer import load_gbuffer
 
     needs = [name for name in ("normal", "position", "depth") if plan.steps(name) is not None]
+    if plan.camera is None and {"depth", "normal"} <= plan.choices.keys():
+        needs = ["normal", "position"]  # which says what lens would fit
     found: dict[str, Any] = {"derived": {}, "warnings": [], "contradiction": None}
     try:
         if needs:

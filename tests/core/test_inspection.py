@@ -1,6 +1,7 @@
 """`deepshade inspect` on files whose answers are known."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,3 +117,23 @@ def test_parse_mapping():
     for bad in (["normal"], ["=x"], ["normal="], ["a=b", "a=c"]):
         with pytest.raises(ConfigError):
             parse_mapping(bad)
+
+
+def test_lenses_and_views():
+    cases = Path(__file__).parents[1] / "cases"
+    flat = inspect_files([cases / "ortho_depth_normal.exr"])
+    assert "--projection orthographic --ortho-width 3.18" in flat["checks"]["warnings"][0]
+    around = inspect_files([cases / "latlong_envmap.exr"])
+    assert around["camera"]["projection"] == "latlong"
+    stereo = inspect_files([cases / "stereo_hero.exr"], view="right")
+    assert (stereo["views"], stereo["view"]) == (["left", "right"], "right")
+    assert stereo["mapped"]["depth"] == "right.Z"
+
+
+def test_a_broken_header_is_part_of_the_report(tmp_path):
+    path = tmp_path / "broken.exr"
+    planes = {f"{name}.{axis}": np.ones((8, 8), np.float32) for name in "PN" for axis in "XYZ"}
+    exr.write(path, planes, attributes={"worldToCamera": np.zeros((4, 4), np.float32)})
+    report = inspect_files([path])
+    assert "can't be inverted" in report["camera"]["unusable"]["matrix"]
+    assert report["camera"]["world_to_camera"] is None

@@ -2,6 +2,7 @@
 
 import io
 import struct
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
@@ -69,3 +70,18 @@ def test_entries_of_the_shot_stay(client, make_exr, compression):
     assert str(after.header()["framesPerSecond"]) == "24000/1001"
     assert after.header().keys().isdisjoint(other)
     assert after.channels()["Y"].pixels.shape == (8, 8)
+
+
+@pytest.mark.parametrize("name", ["header_rich", "win_t05_display_inside"])
+def test_files_of_others(client, name):
+    """Windows, placement and the shot's entries are the input's."""
+    body = (Path(__file__).parents[1] / "cases" / f"{name}.exr").read_bytes()
+    url = "/shade/ao?radius=0.5"
+    answer = client.post(url, content=body, headers={"Content-Type": "image/x-exr"})
+    assert answer.status_code == 200, answer.text
+    there, found = (exr.read_header(data).parts[0] for data in (body, answer.content))
+    assert found.data_window == there.data_window
+    assert found.display_window == there.display_window
+    assert found.entries == there.entries
+    for key in ("pixelAspectRatio", "screenWindowCenter", "worldToCamera"):
+        np.testing.assert_allclose(found.attributes[key], there.attributes[key], rtol=1e-6)

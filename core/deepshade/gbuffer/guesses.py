@@ -73,7 +73,8 @@ def _fitting(normals: Array, depth: Array, camera: Camera, pairs: Pairs) -> tupl
 
     off = [perspective(angle) for angle in _ANGLES]
     best = int(np.argmin(off))
-    near = np.linspace(*_ANGLES[[max(0, best - 1), min(len(_ANGLES) - 1, best + 1)]], 41)
+    low, high = _ANGLES[max(0, best - 1)], _ANGLES[min(len(_ANGLES) - 1, best + 1)]
+    near = np.linspace(float(low), float(high), 41)
     least, angle = min((perspective(angle), angle) for angle in near)
     width, flat = _width(normals, depth, *at, camera), 1.0
     if width > 0:

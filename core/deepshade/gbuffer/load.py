@@ -16,13 +16,15 @@ from deepshade.errors import CameraError, ConfigError, ImageError, MissingAttrib
 from deepshade.exr import Header, Limits
 from deepshade.exr.entries import Entry
 from deepshade.gbuffer import background, channels, derivation, directions
-from deepshade.gbuffer.checks import Verdict, examine
+from deepshade.gbuffer.cameras import framed
+from deepshade.gbuffer.checks import examine
 from deepshade.gbuffer.conventions import Conventions, apply
+from deepshade.gbuffer.examination import Verdict
 from deepshade.gbuffer.gbuffer import GBuffer
 from deepshade.gbuffer.guesses import suggestion
 from deepshade.gbuffer.lenses import number
 from deepshade.gbuffer.mixtures import unmix
-from deepshade.gbuffer.plan import Plan, chosen, framed, plan_gbuffer
+from deepshade.gbuffer.plan import Plan, chosen, plan_gbuffer
 from deepshade.gbuffer.poses import find_pose
 from deepshade.gbuffer.reading import Body, Read, Source, fetch, read_choices
 from deepshade.gbuffer.repair import repair

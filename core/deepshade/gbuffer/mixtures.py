@@ -70,11 +70,12 @@ def unmix(arrays: Mapping[str, Float]) -> tuple[dict[str, str], str]:
         if name not in (*NORMALS, *DEPTHS, *_PLACES):
             continue
         flat = array.reshape(len(array), -1)
-        values, other = flat[:, near], flat[:, far]
+        values: NDArray[Any] = flat[:, near]
+        other = flat[:, far]
         if name in _PLACES:
-            values = 2 * values - other
+            values = np.float32(2) * values - other
         elif name in DEPTHS:
-            values = 1 / (2 / values - 1 / other)
+            values = np.float32(1) / (np.float32(2) / values - np.float32(1) / other)
         array[:, *at] = values
         array[:, rows[thin], columns[thin]] /= coverage[rows[thin], columns[thin]]
         array[:, nothing] = 0
@@ -102,7 +103,7 @@ def _filtered(some: Mapping[str, Float]) -> bool:
     inside = ~_near(empty, _REACH + 1, vertical=False) & ~empty
     if not np.median(coverage[edge]) < _EDGE:
         return False
-    return np.count_nonzero(short & inside) <= _INSIDE * max(1, np.count_nonzero(inside))
+    return bool(np.count_nonzero(short & inside) <= _INSIDE * max(1, int(inside.sum())))
 
 
 def _coverage(arrays: Mapping[str, Float], *, vertical: bool = True) -> tuple[Float, Mask]:

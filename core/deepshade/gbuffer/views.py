@@ -86,7 +86,7 @@ def choose(headers: Sequence[Header], asked: str | None) -> Views:
             )
         return Views(names, known[asked.lower()], default=False)
     if len(names) < 2:
-        return Views(names, *names)
+        return Views(names, names[0] if names else "")
     # the first of a list is the default one; of parts, only of a pair of eyes is it known
     if any(isinstance(part.attributes.get("multiView"), list) for part in parts):
         return Views(names, names[0])
