@@ -293,7 +293,7 @@ def _tiled(effect: Effect, easy: Picture) -> Variants:
 
 
 def _large(effect: Effect, easy: Picture) -> Variants:
-    """8K, the picture over and over, in small tiles; what counts is the answer in the usual ones."""
+    """8K, the picture over and over, in small tiles; the answer in the usual ones counts."""
     height, width = easy.shape
     over = -(-4320 // height), -(-7680 // width)
     planes = {name: np.tile(plane, (1, *over)) for name, plane in easy.planes.items()}
