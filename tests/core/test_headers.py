@@ -16,11 +16,11 @@ def test_there_are_some():
     assert len(FILES) > 20
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_a_header_is_read_or_refused(file):
-    for read in (exr.read_header, exr.read):
+@pytest.mark.parametrize("read", [exr.read_header, exr.read])
+def test_each_is_read_or_refused(read):
+    for file in FILES:
         try:
-            found = read(file.read_bytes(), limits=exr.Limits(pixels=1 << 20, parts=64))
+            found = read(file.read_bytes(), limits=exr.Limits(pixels=1 << 20))
         except DeepshadeError as error:
             assert str(error)
         else:
