@@ -237,7 +237,7 @@ def _moved(effect: Effect, easy: Picture) -> Variants:
     plain = replace(easy, truth=None, white=_white(easy))
 
     def by(u: float, v: float, picture: Picture = plain) -> Picture:
-        plane = np.broadcast_to(np.float32([u, v]).reshape(2, 1, 1), (2, height, width))
+        plane = np.broadcast_to(np.array([u, v], np.float32).reshape(2, 1, 1), (2, height, width))
         return picture.put(motion=np.ascontiguousarray(plane))
 
     for angle, size in ((1e-6, 20.0), (-1e-6, 20.0), (1e-3, 2.0), (-1e-3, 2.0)):
