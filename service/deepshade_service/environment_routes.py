@@ -34,8 +34,10 @@ def install(app: FastAPI, environments: Environments, uploads: Uploads, settings
         tags=["environments"],
         summary="A small picture of a map",
         response_class=Response,
-        responses={200: {"content": {"image/png": {"schema": _BINARY}}}}
-        | errors({404: "There is no such map", 422: "Its file can't be used"}),
+        responses={
+            200: {"content": {"image/png": {"schema": _BINARY}}},
+            **errors({404: "There is no such map", 422: "Its file can't be used"}),
+        },
     )
     async def thumbnail(name: str) -> Response:
         return Response(await environments.thumbnail(name), media_type="image/png")

@@ -7,8 +7,11 @@ import pytest
 import torch
 
 from deepshade import metrics
+from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError
 from deepshade_trainer.losses import dssim, parse_loss
+from deepshade_trainer.networks import Shader, build
+from deepshade_trainer.recipe import preset
 
 
 def pair(seed: int = 0, offset: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -50,3 +53,12 @@ def test_gradients_of_flat_images_are_finite() -> None:
 def test_unknown_terms_are_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         parse_loss(text)
+
+
+def test_a_black_reference_teaches_without_overflow() -> None:
+    """As it is judged: what is all black is not exposed."""
+    shader = Shader(EFFECTS["gi"], build(preset("balanced", "gi").network))
+    image = torch.full((1, 3, 16, 16), -1e-3, requires_grad=True)
+    loss = dssim(*shader.compared(image, torch.zeros(1, 3, 16, 16)))
+    loss.backward()
+    assert torch.isfinite(loss) and torch.isfinite(image.grad).all()

@@ -15,7 +15,6 @@ import numpy as np
 
 from deepshade.attributes import ATTRIBUTES, CAMERA_DIRECTION, RADIANCE, WORLD_DIRECTION
 from deepshade.effects import Effect
-from deepshade.exr.limits import Limits
 from deepshade_report.hardcases import made
 from deepshade_report.hardcases.picture import LENGTHS, Picture, unit_is_length
 
@@ -238,7 +237,7 @@ def _moved(effect: Effect, easy: Picture) -> Variants:
     plain = replace(easy, truth=None, white=_white(easy))
 
     def by(u: float, v: float, picture: Picture = plain) -> Picture:
-        plane = np.broadcast_to(np.float32([u, v]).reshape(2, 1, 1), (2, height, width))
+        plane = np.broadcast_to(np.array([u, v], np.float32).reshape(2, 1, 1), (2, height, width))
         return picture.put(motion=np.ascontiguousarray(plane))
 
     for angle, size in ((1e-6, 20.0), (-1e-6, 20.0), (1e-3, 2.0), (-1e-3, 2.0)):
@@ -294,15 +293,15 @@ def _tiled(effect: Effect, easy: Picture) -> Variants:
 
 
 def _large(effect: Effect, easy: Picture) -> Variants:
-    """8K: the picture over and over; each copy with as much around it has one answer."""
+    """8K, the picture over and over, in small tiles; the answer in the usual ones counts."""
     height, width = easy.shape
     over = -(-4320 // height), -(-7680 // width)
     planes = {name: np.tile(plane, (1, *over)) for name, plane in easy.planes.items()}
-    size = over[0] * height, over[1] * width
-    assert size[0] * size[1] < Limits().pixels
-    camera = replace(easy.camera, width=size[1], height=size[0], x0=0, y0=0)
+    planes = {n: np.ascontiguousarray(plane[:, :4320, :7680]) for n, plane in planes.items()}
+    camera = replace(easy.camera, width=7680, height=4320, x0=0, y0=0)
     whole = replace(easy, planes=planes, camera=camera, truth=None, white=_white(easy))
-    yield f"{size[1]} x {size[0]}", whole.ask(trust=True)
+    whole = whole.ask(trust=True)
+    yield "7680 x 4320", replace(whole, tiles=1 << 21, like=whole)
 
 
 _STEP = "16 bits hold no more: the truth lies anywhere within a step"

@@ -118,8 +118,8 @@ def _shader(bundle: Bundle) -> nn.Module:
     if network.get("kind") == "reflections":
         return Reflections(network["lobes"]).eval()
     if network.get("kind") == "lens":
-        parts = [_part(bundle, digest) for digest in network["of"]]
-        return lens(*parts, network["lobes"])
+        occlusion, blur = (_part(bundle, digest) for digest in network["of"])
+        return lens(occlusion, blur, network["lobes"])
     return from_bundle(bundle.path)
 
 

@@ -55,7 +55,8 @@ def rows(bundle: Bundle, easy: Picture) -> Iterator[Row]:
     """How far each precision's gradient is from float64's; nothing for what isn't trained."""
     if "lobes" in bundle.network:  # tables, or a chain of bundles that are trained alone
         return
-    effect, known = EFFECTS[bundle.effect], {}
+    effect = EFFECTS[bundle.effect]
+    known: dict[str, Float] = {}
     for name, picture in patches(effect, easy):
         exact = gradient(from_bundle(bundle.path).double(), bundle, picture, "float64")
         known.setdefault("float64", exact)
@@ -76,9 +77,8 @@ def gradient(shader: Shader, bundle: Bundle, picture: Picture, precision: str) -
     assert picture.truth is not None
     by = picture.header.get("radius") or tensors.median_depth(picture.planes) or 1.0
     effect, multiple = EFFECTS[bundle.effect], bundle.size_multiple
-    shape = {"per_channel": bundle.per_channel, "multiple": multiple}
-    planes = dict(picture.planes)
-    gbuffer = tensors.tensor(effect, planes, bundle.inputs, by, **shape)
+    planes, runs = dict(picture.planes), bundle.per_channel
+    gbuffer = tensors.tensor(effect, planes, bundle.inputs, by, per_channel=runs, multiple=multiple)
     given = _given(bundle, picture)
     height, width = picture.shape
     shader.train()
@@ -105,7 +105,9 @@ def _given(bundle: Bundle, picture: Picture) -> list[Float]:
     """What the network takes beside the G-buffer, of the picture's environment or a white one."""
     around = (picture.surroundings or white_world()).environment
     names = bundle.environment
-    found = prepared(around).inputs(names, 0.0, "y", lambda: np.eye(3)) if names else {}
+    if not names:
+        return []
+    found: dict[str, Float] = prepared(around).inputs(names, 0.0, "y", lambda: np.eye(3))
     return [found[name] for name in names]
 
 

@@ -151,10 +151,9 @@ class Bench:
                 truth = self.shade(engine, picture.like)
         except (DeepshadeError, Problem) as problem:
             said = f"{getattr(problem, 'kind', type(problem).__name__)}: {problem}"
-            row = Row(*names, "", *[None] * 5, picture.refused, case.why, said)
-            return row, picture, None
+            return _unanswered(names, picture.refused, case.why, said), picture, None
         if truth is None or picture.refused:
-            return Row(*names, "", *[None] * 5, False, "answered, where it can't be"), picture, None
+            return _unanswered(names, False, "answered, where it can't be"), picture, None
         off = deviation(self.effect, picture, answer, truth)
         floor = FLOORS[engine.backend.precision]
         if picture.tiles is not None:
@@ -187,6 +186,12 @@ class Bench:
             return "closed form", own, mean_error(self.effect, easy, known, None)
         error = structural(self.effect, answer, picture.truth, picture.compared)
         return "reference", error, structural(self.effect, easy, known, picture.compared)
+
+
+def _unanswered(
+    names: tuple[str, str, str, str, str], passed: bool, why: str, refused: str = ""
+) -> Row:
+    return Row(*names, "", None, None, None, None, None, passed, why, refused)
 
 
 def deviation(effect: Effect, picture: Picture, answer: Float, exact: Float) -> float:

@@ -105,7 +105,9 @@ class Picture:
             narrow |= set(names) if name in self.half else set()
         height, width = self.shape
         x, y = self.camera.x0, self.camera.y0
-        header = {SETTINGS[name].header: float(value) for name, value in self.header.items()}
+        header: dict[str, Any] = {
+            SETTINGS[name].header: float(value) for name, value in self.header.items()
+        }
         header |= {
             "deepshade:fov": self.camera.fov,
             "worldToCamera": self.camera.matrix.T.astype(np.float32),

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.engines import REFERENCE, Backend, usable
@@ -72,7 +73,11 @@ class Session:
                         bench = Bench(bundle, self._backends(bundle), self._shape, self.threads)
                     found = self._rows(bench, case)
                     with self.file.open("a", encoding="utf-8") as file:
-                        line = {"stamp": stamp, "effect": bundle.effect, "bundle": bundle.name}
+                        line: dict[str, Any] = {
+                            "stamp": stamp,
+                            "effect": bundle.effect,
+                            "bundle": bundle.name,
+                        }
                         line |= {"case": case.name, "rows": [row.as_json() for row in found]}
                         file.write(json.dumps(line) + "\n")
                 yield done, total, found

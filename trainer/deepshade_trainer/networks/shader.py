@@ -122,7 +122,9 @@ class Shader(nn.Module):
         image = transfer.inverse(image, self.transfer, torch)
         flat = reference[:, :, ::2, ::2].flatten(1)  # plenty, and sorting takes long
         white = torch.quantile(flat, 0.99, dim=1)
-        white = torch.where(white > _BLACK, white, flat.amax(1).clamp_min(_BLACK))
+        white = torch.where(white > _BLACK, white, flat.amax(1))
+        # all is black: as `metrics.exposure`, or what little an answer gives there would overflow
+        white = torch.where(white > _BLACK, white, torch.ones_like(white))
         factor = (1 / white)[:, None, None, None]
         return _bent(image * factor), _bent(reference * factor)
 
