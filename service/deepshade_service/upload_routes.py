@@ -17,11 +17,13 @@ from deepshade.errors import DeepshadeError
 from deepshade.gbuffer import channels as naming
 from deepshade.gbuffer.channels import Layer
 from deepshade.gbuffer.plan import Plan, plan_gbuffer
+from deepshade_service import problems
 from deepshade_service.described import errors
 from deepshade_service.memory import bytes_to_read
 from deepshade_service.models import Models
+from deepshade_service.parameters import ShadeParameters
 from deepshade_service.problems import Problem
-from deepshade_service.uploads import Upload
+from deepshade_service.uploads import FORM_TYPE, RAW_TYPES, Upload
 
 if TYPE_CHECKING:
     from deepshade_service.app import Service
@@ -37,6 +39,12 @@ _KEPT = {
     413: "Over a limit",
     422: "A file that can't be read as a picture",
     429: "The queue is full; see Retry-After",
+}
+_BINARY = {"type": "string", "format": "binary"}
+_BODY = {
+    "required": True,
+    "content": {kind: {"schema": _BINARY} for kind in RAW_TYPES}
+    | {FORM_TYPE: {"schema": {"type": "object", "additionalProperties": _BINARY}}},
 }
 
 
@@ -66,6 +74,7 @@ def install(app: FastAPI, service: Service) -> None:
         summary="Keep a picture for a while",
         status_code=201,
         responses=errors({422: "A file that can't be read as a picture"}, uploads=True),
+        openapi_extra={"requestBody": _BODY},
     )
     async def add(request: Request) -> dict[str, Any]:
         """The body is as that of `/shade`. The answer's `name` stands for it in `?upload=`, and the
@@ -94,7 +103,7 @@ def install(app: FastAPI, service: Service) -> None:
         tags=["uploads"],
         summary="One layer's pixels",
         response_class=Response,
-        responses={200: {"content": {"image/x-exr": {}}}} | errors(_KEPT),
+        responses={200: {"content": {"image/x-exr": {"schema": _BINARY}}}} | errors(_KEPT),
     )
     async def layer(name: str, index: int) -> Response:
         """An uncompressed EXR of `Y`, or of `R G B A` as far as the layer has channels, in the
@@ -200,7 +209,8 @@ def _lacks(plan: Plan, bundles: Sequence[Sequence[str]]) -> str:
         try:
             plan.require(inputs)
         except DeepshadeError as error:
-            why = "; ".join(filter(None, (str(error), error.fix)))
+            problem = problems.from_error(error, ShadeParameters.model_fields)
+            why = "; ".join(filter(None, (problem.detail, problem.more.get("fix"))))
         else:
             return ""
     return why

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
 RAW_TYPES = ("image/x-exr", "image/exr", "application/octet-stream")
-_FORM_TYPE = "multipart/form-data"
+FORM_TYPE = "multipart/form-data"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,17 +71,17 @@ class Uploads:
         """
         kind, parameters = parse_options_header(request.headers.get("content-type", ""))
         media_type = kind.decode("latin-1")
-        if media_type not in (*RAW_TYPES, _FORM_TYPE):
+        if media_type not in (*RAW_TYPES, FORM_TYPE):
             raise Problem(
                 415,
                 "unsupported-type",
                 f"the body's Content-Type is '{media_type[:100]}'",
-                fix=f"send one EXR as {RAW_TYPES[0]}, or files as {_FORM_TYPE}",
-                supported=[*RAW_TYPES, _FORM_TYPE],
+                fix=f"send one EXR as {RAW_TYPES[0]}, or files as {FORM_TYPE}",
+                supported=[*RAW_TYPES, FORM_TYPE],
             )
         body = _Body(self, self._settings.limits.body_bytes, self._settings.uploads)
         try:
-            if media_type == _FORM_TYPE:
+            if media_type == FORM_TYPE:
                 reading = _read_form(
                     body.chunks(request), parameters.get(b"boundary"), self._settings.files
                 )

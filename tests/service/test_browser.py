@@ -35,7 +35,7 @@ FLAGS = [
     "--disable-sync",
 ]
 EXR = {"Content-Type": "image/x-exr"}
-PATIENCE = 60_000  # ms: nothing here is about time, and machines are busy
+PATIENCE = 120_000  # ms: nothing here is about time, and machines are busy
 playwright.expect.set_options(timeout=PATIENCE)
 
 

@@ -155,6 +155,12 @@ def test_who_names_what_is_not_kept_learns_what_to_do(client, make_exr):
     assert both.status_code == 422 and "body" in both.json()["detail"]
 
 
+def test_what_an_effect_lacks_is_said_in_the_words_of_a_query(client, make_exr):
+    body = make_exr({"Z": np.full((16, 16), 3, np.float32)})
+    lacks = client.post("/uploads", content=body, headers=EXR).json()["effects"]["ao"]["lacks"]
+    assert "?fov=" in lacks and "--fov" not in lacks
+
+
 def test_samples_need_no_upload(client):
     names = client.get("/samples").json()
     assert names

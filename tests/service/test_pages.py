@@ -44,7 +44,13 @@ def test_the_pages_load_only_what_is_served_and_only_as_files_of_their_own(clien
         )
         found = re.findall(r"""(?:src|href)="((?:\.\./)?page/[^"]+)"|from '(\./[^']+)'""", text)
         todo += [urljoin(url, next(filter(None, groups))) for groups in found]
-    assert len(seen) > 10
+    modules = {url for url in seen if url.endswith(".js")}
+    assert len(modules) > 10
+    asked = "".join(client.get(page).text for page in ("/", "/live/any"))
+    early = {
+        f"/page/{name}" for name in re.findall(r'(?:preload" href|src)="[^"]*?([\w.]+js)"', asked)
+    }
+    assert early == modules  # none waits until another that imports it has come
 
 
 def test_the_page_s_files_are_sent_once_and_named_plainly(client):

@@ -1,22 +1,29 @@
 // The page that shades: a picture comes in, settings change, the answer is looked at and taken along.
 
 import {$, bytes, digits, el, plain, say} from './dom.js';
-import {FAR, Picture, compare, kindOf, share} from './picture.js';
+import * as drop from './drop.js';
+import {pick} from './pick.js';
+import {Picture, kindOf, share} from './picture.js';
+import {apart, strays, valuesAt} from './readout.js';
+import * as report from './report.js';
 import {ask, json, Problem, Source} from './service.js';
 import {Settings} from './settings.js';
 import {curl, named, python} from './snippets.js';
+import {copy, save} from './take.js';
 import * as theme from './theme.js';
 import {Tools} from './tools.js';
 import {Viewer} from './viewer.js';
 import {planInWords, timingInWords} from './words.js';
 
 const ANSWER = 'answer', FIRST_SAMPLE = 'room';
+const OF_THE_FILE = ['append', 'layer', 'multiply', 'half', 'compression'];  // not of its values
 const SCENE = {median: 1, near: .1, far: 10};  // until the picture is measured
 const effects = new Map();
 let source = null, effect = null, answer = null;
 let layers = new Map();  // index -> promise of a Picture
 let chosen = {a: ANSWER, b: null}, chosenByHand = false, modeByHand = false;
-let shading = false, again = false, opening = null;
+let shading = false, again = false, stale = false, retrying;
+let opening = 0, turn = 0;  // pictures that are under way, and the number of the last
 let fresh = false;  // whether the answer to come is the first of its picture and effect
 
 const settings = new Settings($('settings'), () => shade(), pickDistance);
@@ -25,7 +32,8 @@ const {viewer, tools} = makeViewer();
 function makeViewer() {
   try {
     const viewer = new Viewer($('canvas'));
-    const tools = new Tools($('tools'), viewer, {choose, auto: () => (viewer.pictures.a ?? viewer.pictures.b)?.autoExposure() ?? 0});
+    const auto = () => (viewer.pictures.a ?? viewer.pictures.b)?.autoExposure() ?? 0;
+    const tools = new Tools($('tools'), viewer, {choose, auto});
     return {viewer, tools};
   } catch (error) {
     say($('nothing'), error.message);
@@ -35,20 +43,23 @@ function makeViewer() {
 
 /* Pictures */
 
-/** Open files or a sample: its layers are looked at while it is shaded. `quiet`: if it is there. */
-async function open(files, sample, quiet = false) {
-  const opened = new Source(files, sample);
-  clearProblem();
-  busy('Sending …', 0);
+/** Open files or a sample, and shade. Whoever opens something else meanwhile gets that; a sample that
+ *  nobody asked for is `optional`. */
+async function open(files, sample, optional = false) {
+  const opened = new Source(files, sample), mine = ++turn;
+  report.clear();
+  report.progress(0);
+  opening++;
   try {
-    await opened.open(progress);
+    await opened.open(report.progress);
   } catch (error) {
-    if (!(quiet && error.status === 404)) fail(error);
+    if (mine === turn && !(optional && error.status === 404)) fail(error);
     return;
   } finally {
-    busy();
+    opening--;
+    report.busy();
   }
-  if (quiet && source) return;  // somebody was quicker
+  if (mine !== turn) return;
   source = opened;
   layers = new Map();
   chosenByHand = false;
@@ -75,8 +86,8 @@ async function settle() {
   const from = source;
   if (!chosenByHand) chosen.b = usual();
   offer();
-  const beauty = from.held.layers.some(each => each.attribute === 'beauty' || String(each.channels) === 'R,G,B');
-  $('multiplied').hidden = effect.light || !beauty;
+  const isBeauty = layer => layer.attribute === 'beauty' || String(layer.channels) === 'R,G,B';
+  $('multiplied').hidden = effect.light || !from.held.layers.some(isBeauty);
   settings.show(effect, from.scene ?? SCENE);
   fresh = true;
   // the reference first, for it is there at once; lengths wait until something is seen
@@ -101,8 +112,9 @@ function usual() {
 const hasReference = () => source.held.layers[chosen.b]?.reference === effect.name;
 
 function offer() {
-  const {layers: all} = source.held, several = source.held.files.length > 1;
-  const entries = all.map((layer, index) => [String(index), plain(several ? `${layer.name} (${source.held.files[layer.file].name})` : layer.name)]);
+  const {layers: all, files} = source.held;
+  const from = layer => files.length > 1 ? ` (${files[layer.file].name})` : '';
+  const entries = all.map((layer, index) => [String(index), plain(layer.name + from(layer))]);
   tools?.offer([
     ['Made here', [[ANSWER, effect.title]]],
     ['References', entries.filter((_, index) => all[index].reference)],
@@ -115,8 +127,8 @@ function offer() {
 
 /** The layer whose last channel says how far surfaces are away; undefined if there is none. */
 function distances() {
-  const {layers: all} = source.held;
-  return ['depth', 'distance', 'position'].map(name => all.findIndex(layer => layer.attribute === name)).find(at => at >= 0);
+  const find = name => source.held.layers.findIndex(layer => layer.attribute === name);
+  return ['depth', 'distance', 'position'].map(find).find(at => at >= 0);
 }
 
 /** The median depth of the picture, and the nearest and farthest: what lengths are measured by. */
@@ -125,7 +137,8 @@ async function measure() {
   if (index === undefined) return SCENE;
   try {
     const picture = await layer(index);
-    const depths = picture.sorted(pixel => Math.abs(picture.value(picture.order.at(-1), pixel))).filter(value => value > 0);
+    const depth = pixel => Math.abs(picture.value(picture.order.at(-1), pixel));
+    const depths = picture.sorted(depth).filter(value => value > 0);
     const [near, median, far] = [.02, .5, .98].map(part => share(depths, part));
     return near > 0 && far > near ? {near, median, far} : SCENE;
   } catch {
@@ -133,26 +146,9 @@ async function measure() {
   }
 }
 
-/** How far what is clicked at is away, or what Enter chooses at the cursor; null at Escape. */
 async function pickDistance() {
-  const index = source && distances(), canvas = $('canvas');
-  if (!viewer || index === undefined) return null;
-  const picture = await layer(index);
-  $('values').value = 'Click at a surface. With keys: arrows and Enter; Escape leaves it.';
-  document.body.classList.add('picking');
-  canvas.focus();
-  const done = new AbortController(), {signal} = done;
-  const chosen = await new Promise(resolve => {
-    canvas.addEventListener('click', () => resolve(viewer.cursor), {signal});
-    addEventListener('keydown', ({key}) => {
-      if (key === 'Enter') resolve(viewer.cursor);
-      if (key === 'Escape') resolve(null);
-    }, {signal});
-  });
-  done.abort();
-  document.body.classList.remove('picking');
-  const found = chosen && Math.abs(picture.at(...chosen)?.at(-1));
-  return found > 0 && found < FAR ? found : null;
+  const index = source && distances();
+  return viewer && index !== undefined ? pick(viewer, await layer(index)) : null;
 }
 
 function layer(index) {
@@ -161,7 +157,7 @@ function layer(index) {
     const got = from.use(async name => {
       const response = await ask(`uploads/${name}/layers/${index}`);
       return Picture.from(await response.arrayBuffer(), kindOf(about, effects));
-    }, progress);
+    }, report.progress);
     layers.set(index, got);
     got.catch(() => layers.delete(index));
   }
@@ -198,56 +194,42 @@ function exposeFor(picture) {
 
 function label() {
   for (const side of ['a', 'b']) {
-    const {select} = tools.selects[side];
-    $(`name${side.toUpperCase()}`).textContent = viewer.pictures[side] ? select.selectedOptions[0]?.textContent ?? ''
-      : shading ? 'shading …' : '';
+    const {select} = tools.selects[side], old = stale && chosen[side] === ANSWER ? ', before the problem' : '';
+    const name = `${select.selectedOptions[0]?.textContent ?? ''}${old}`;
+    $(`name${side.toUpperCase()}`).textContent = viewer.pictures[side] ? name : shading ? 'shading …' : '';
   }
   tools.alone(!viewer.pictures.a || !viewer.pictures.b);
-  const {a, b} = viewer.pictures, apart = a && b && a !== b ? compare(a, b) : null;
-  $('apart').textContent = apart ? `mean |A − B| ${digits(apart.mean, 3)}, bias ${digits(apart.bias, 3)}${strays()}` : '';
-  $('canvas').setAttribute('aria-label', `A: ${$('nameA').textContent}. B: ${$('nameB').textContent}. Arrow keys move a cursor from pixel to pixel.`);
+  const referred = answer && Object.values(chosen).some(value => source.held.layers[value]?.reference);
+  const other = referred ? strays(effect.settings, source.held.settings, answer.plan) : '';
+  $('apart').textContent = apart(viewer.pictures) + (other && `; the reference has ${other}`);
+  $('canvas').setAttribute('aria-label', `A: ${$('nameA').textContent}. B: ${$('nameB').textContent}.`
+    + ' Arrow keys move a cursor from pixel to pixel.');
   values();
 }
 
-/** What the file's references were made with, where the answer was made with something else. */
-function strays() {
-  if (!answer || !Object.values(chosen).some(value => source.held.layers[value]?.reference)) return '';
-  const said = source.held.settings, used = answer.plan;
-  const other = effect.settings.map(({name}) => name).filter(name => name in said && used[name] !== undefined
-    && (typeof used[name] === 'number' ? Math.abs(used[name] - said[name]) > 1e-3 * Math.abs(said[name]) : used[name] !== said[name]));
-  const values = other.map(name => `${name} ${typeof said[name] === 'number' ? digits(said[name]) : plain(said[name])}`);
-  return other.length ? `; the reference has ${values.join(', ')}` : '';
-}
-
 function values() {
-  const {cursor} = viewer;
-  if (!cursor) return;
-  const [x, y] = cursor, read = side => viewer.pictures[side]?.at(x, y);
-  const [a, b] = [read('a'), read('b')];
-  const text = found => found ? found.map(value => digits(value, 4)).join(' ') : '–';
-  let line = `${x}, ${y}   A ${text(a)}   B ${text(b)}`;
-  if (a && b && viewer.pictures.a !== viewer.pictures.b) {
-    const apart = Array.from({length: Math.min(3, Math.max(a.length, b.length))}, (_, c) => (a[c] ?? a[0]) - (b[c] ?? b[0]));
-    line += `   A − B ${text(apart)}`;
-  }
-  $('values').value = line;
+  if (viewer.cursor) $('values').value = valuesAt(viewer.pictures, viewer.cursor);
 }
 
 /* Shading */
 
-/** What is asked for, as [name, value] pairs. */
-function query() {
-  const bundle = $('bundle').value ? [['bundle', $('bundle').value]] : [];
-  return [...settings.query, ...bundle, ...new URLSearchParams($('more').value)];
-}
-
-/** And what of the answer is taken along. */
+/** What is asked for, as [name, value] pairs: to be taken along. */
 function queryToTake() {
+  const bundle = $('bundle').value ? [['bundle', $('bundle').value]] : [];
   const on = (id, name, value) => $(id).checked && !$(id).closest('[hidden]') ? [[name, value]] : [];
-  return [...query(), ...on('append', 'append', '1'), ...on('multiply', 'multiply', '1'), ...on('float', 'half', 'false')];
+  return [...settings.query, ...bundle, ...new URLSearchParams($('more').value),
+    ...on('append', 'append', '1'), ...on('multiply', 'multiply', '1'), ...on('float', 'half', 'false')];
 }
 
-const shadePath = (name, pairs) => `shade/${effect.name}?${new URLSearchParams([['upload', decodeURIComponent(name)], ...pairs])}`;
+/** The same to be looked at: the answer alone, as readExr takes it. */
+const queryToSee = () =>
+  [...queryToTake().filter(([name]) => !OF_THE_FILE.includes(name)), ['compression', 'none']];
+
+/** The response to a request to shade. */
+const request = pairs => source.use(name => {
+  const query = new URLSearchParams([['upload', name], ...pairs]);
+  return ask(`shade/${effect.name}?${query}`, {method: 'POST'});
+}, report.progress);
 
 /** Shade with the settings as they are now: one request at a time, and the latest wins. */
 async function shade() {
@@ -260,19 +242,21 @@ async function shade() {
     return;
   }
   shading = true;
-  const timer = setTimeout(() => busy('Shading …'), 150);
+  const timer = setTimeout(() => report.busy('Shading …'), 150);
   if (viewer && !answer) label();
   try {
     do {
       again = false;
       await shadeOnce();
     } while (again);
+    stale = false;
   } catch (error) {
+    stale = true;
     fail(error);
   } finally {
     clearTimeout(timer);
     shading = false;
-    busy();
+    report.busy();
     if (viewer) label();
   }
   if (again) shade();
@@ -280,7 +264,7 @@ async function shade() {
 
 async function shadeOnce() {
   const asked = {source, effect}, start = performance.now();
-  const response = await source.use(name => ask(shadePath(name, [...query(), ['compression', 'none']]), {method: 'POST'}), progress);
+  const response = await request(queryToSee());
   const body = await response.arrayBuffer();
   if (asked.source !== source || asked.effect !== effect) {
     again = true;
@@ -289,7 +273,7 @@ async function shadeOnce() {
   const picture = Picture.from(body, effect.light ? 'light' : 'factor');
   answer = picture;
   picture.plan = JSON.parse(picture.attributes['deepshade:plan']);
-  clearProblem();
+  report.clear();
   if (fresh) exposeFor(picture);
   fresh = false;
   for (const side of ['a', 'b']) if (chosen[side] === ANSWER) viewer?.show(side, picture);
@@ -317,51 +301,17 @@ function tell(plan) {
 
 async function download() {
   $('download').disabled = true;
-  try {
-    const asked = queryToTake();
-    const response = await source.use(name => ask(shadePath(name, asked), {method: 'POST'}), progress);
-    const url = URL.createObjectURL(await response.blob());
-    el('a', {href: url, download: named(source, effect.name).replace(/^\.\//, '')}).click();
-    setTimeout(() => URL.revokeObjectURL(url), 60000);
-  } catch (error) {
-    fail(error);
-  }
+  const name = named(source, effect.name);
+  await request(queryToTake()).then(response => save(response, name)).catch(fail);
   $('download').disabled = false;
 }
 
-async function copy(text, what) {
-  $('snippet').textContent = text;
-  $('snippet').hidden = false;
-  try {
-    await navigator.clipboard.writeText(text);
-    $('copied').textContent = `Copied: ${what}.`;
-  } catch {  // no permission, or no HTTPS
-    getSelection().selectAllChildren($('snippet'));
-    $('copied').textContent = 'Selected: copy it with your keys.';
-  }
-}
-
-/* What is said */
-
-function busy(text, part) {
-  $('progress').hidden = !text;
-  if (!text) return;
-  $('progress').setAttribute('aria-label', text);
-  if (part === undefined) $('progress').removeAttribute('value');
-  else $('progress').value = part;
-}
-
-const progress = part => busy('Sending …', part);
-
+/** Say what went wrong; a service that is gone is asked again until it is back. */
 function fail(error) {
-  if (!(error instanceof Problem)) console.error(error);
-  $('problem').replaceChildren(el('p', {}, plain(error.message)), ...(error.fix ? [el('p', {className: 'fix'}, plain(error.fix))] : []));
-  $('problem').hidden = false;
-  if (error.kind === 'unreachable') setTimeout(() => shading || $('problem').hidden || (source ? shade() : begin()), 2000);
-}
-
-function clearProblem() {
-  $('problem').hidden = true;
+  report.fail(error);
+  if (error.kind !== 'unreachable') return;
+  clearTimeout(retrying);
+  retrying = setTimeout(() => report.failed() && (source && effect ? shade() : begin()), 2000);
 }
 
 /* The beginning */
@@ -369,25 +319,29 @@ function clearProblem() {
 function chooseEffect(name) {
   effect = effects.get(name);
   $('effect').value = name;
-  $('bundle').replaceChildren(el('option', {value: ''}, 'usual bundle'), ...effect.bundles.map(({name, dssim}) =>
-    el('option', {value: name}, `${name}${dssim == null ? '' : `, DSSIM ${digits(dssim, 3)}`}`)));
+  const error = dssim => dssim == null ? '' : `, DSSIM ${digits(dssim, 3)}`;
+  $('bundle').replaceChildren(el('option', {value: ''}, 'usual bundle'),
+    ...effect.bundles.map(({name, dssim}) => el('option', {value: name}, name + error(dssim))));
 }
 
 async function begin() {
   const wanted = new URLSearchParams(location.hash.slice(1));
-  opening ??= open(null, wanted.get('sample') ?? FIRST_SAMPLE, !wanted.get('sample'));
+  if (!source && !opening) open(null, wanted.get('sample') ?? FIRST_SAMPLE, !wanted.get('sample'));
   try {
     const [samples, found, maps] = await Promise.all([json('samples'), json('effects'), json('environments')]);
     settings.environments = maps.map(map => map.name);
-    $('sample').replaceChildren(el('option', {value: ''}, '–'), ...samples.map(name => el('option', {value: name}, name)));
+    const options = (list, read) => list.map(each => el('option', ...read(each)));
+    $('sample').replaceChildren(el('option', {value: ''}, '–'),
+      ...options(samples, name => [{value: name}, name]));
     $('sample').value = source?.sample ?? '';
     for (const each of found.filter(each => each.bundles.length)) effects.set(each.name, each);
     if (!effects.size) {
       say($('lacks'), 'The service is still loading …', 'note');
       return void setTimeout(begin, 500);
     }
-    $('effect').replaceChildren(...[...effects.values()].map(each => el('option', {value: each.name}, each.title)));
-    const most = [...effects.values()].reduce((best, each) => each.bundles.length > best.bundles.length ? each : best);
+    const all = [...effects.values()];
+    $('effect').replaceChildren(...options(all, each => [{value: each.name}, each.title]));
+    const most = all.reduce((best, each) => each.bundles.length > best.bundles.length ? each : best);
     chooseEffect(effects.has(wanted.get('effect')) ? wanted.get('effect') : most.name);
     await settle();
   } catch (error) {
@@ -397,7 +351,8 @@ async function begin() {
 
 /** #sample=…&effect=… of the address, so that a link leads to what it shows. */
 function remember() {
-  if (effect) history.replaceState(null, '', `#${new URLSearchParams({...(source?.sample ? {sample: source.sample} : {}), effect: effect.name})}`);
+  const state = {...(source?.sample ? {sample: source.sample} : {}), effect: effect.name};
+  history.replaceState(null, '', `#${new URLSearchParams(state)}`);
 }
 
 $('open').addEventListener('click', () => $('files').click());
@@ -408,41 +363,23 @@ $('files').addEventListener('change', () => {
 $('sample').addEventListener('change', () => $('sample').value && open(null, $('sample').value));
 $('effect').addEventListener('change', () => {
   chooseEffect($('effect').value);
-  settle().finally(remember);
+  noAnswer();
+  remember();
+  settle();
 });
 for (const id of ['bundle', 'more']) $(id).addEventListener('change', () => shade());
 $('download').addEventListener('click', download);
-$('curl').addEventListener('click', () => copy(curl(source, effect.name, queryToTake()), 'a line for a shell'));
-$('python').addEventListener('click', () => copy(python(source, effect.name, queryToTake()), 'lines of Python'));
+const copies = {curl: [curl, 'a line for a shell'], python: [python, 'lines of Python']};
+for (const [id, [text, what]] of Object.entries(copies))
+  $(id).addEventListener('click', () => copy(text(source, effect.name, queryToTake()), what));
 $('help').addEventListener('click', () => $('keys').showModal());
 
-let inside = 0;  // elements that something is dragged over
-const hasFiles = event => event.dataTransfer?.types.includes('Files');
-for (const [name, by] of [['dragenter', 1], ['dragleave', -1]]) {
-  addEventListener(name, event => {
-    if (!hasFiles(event)) return;
-    inside += by;
-    $('drop').hidden = inside <= 0;
-  });
-}
-addEventListener('dragover', event => hasFiles(event) && event.preventDefault());
-addEventListener('drop', event => {
-  if (!hasFiles(event)) return;
-  event.preventDefault();
-  inside = 0;
-  $('drop').hidden = true;
-  const files = [...event.dataTransfer.files];
-  if (files.length) open(files);
-});
-
-theme.install($('theme'), () => {
-  const colour = getComputedStyle($('canvas')).backgroundColor.match(/[\d.]+/g)?.slice(0, 3).map(part => part / 255);
-  if (colour) viewer?.set({surround: colour});
-});
+drop.install($('drop'), open);
+theme.install($('theme'), surround => viewer?.set({surround}));
 if (viewer) {
   $('keylist').replaceChildren(...tools.listKeys());
   viewer.addEventListener('cursor', () => values());
   viewer.addEventListener('problem', event => fail(new Problem(event.detail)));
-  for (const input of tools.modes.querySelectorAll('input')) input.addEventListener('change', () => { modeByHand = true; });
+  tools.modes.addEventListener('change', () => { modeByHand = true; });
 }
 begin();

@@ -1,8 +1,9 @@
 // The page that watches: what a publisher streams, how old it is, and when it stands still.
 
-import {$, bytes, digits, el, plain, say} from './dom.js';
+import {$, bytes, el, plain, say} from './dom.js';
 import {REST, decode, readFrame} from './frame.js';
-import {Picture, compare} from './picture.js';
+import {Picture} from './picture.js';
+import {apart, valuesAt} from './readout.js';
 import {json} from './service.js';
 import {Session} from './session.js';
 import * as theme from './theme.js';
@@ -123,8 +124,9 @@ session.addEventListener('message', ({detail}) => {
     offerEffects(detail.effects);
     update();
   } else if (detail.type === 'about') {
-    $('plan').replaceChildren(...Object.entries(detail.effects).flatMap(([effect, plan]) =>
-      planInWords(plan).map((sentence, index) => el('li', {}, `${index ? '' : `${effect}: `}${sentence}`))));
+    const told = ([effect, plan]) =>
+      planInWords(plan).map((sentence, index) => el('li', {}, `${index ? '' : `${effect}: `}${sentence}`));
+    $('plan').replaceChildren(...Object.entries(detail.effects).flatMap(told));
   } else if (detail.type === 'problem' && detail.id !== undefined) {
     happened(`Frame ${detail.id}: ${detail.problem.detail}`);
   }
@@ -143,7 +145,7 @@ function offerEffects(names) {
 /** [state, text]: a picture that stands still must not look alive. */
 function judge() {
   const age = shown ? session.age(shown.time) : 0, old = shown ? ` The picture is ${seconds(age)} old.` : '';
-  if (link === 'ended') return ['frozen', `No session “${plain(name)}” now; it is shown when it begins.${old}`];
+  if (link === 'ended') return ['frozen', `No session “${plain(name)}” now; it is seen when it begins.${old}`];
   if (link === 'refused') return ['frozen', `Refused.${old}`];
   if (link === 'lost') return ['frozen', `Frozen: ${plain(why)} Trying again.${old}`];
   if (link === 'connecting') return ['waiting', 'Connecting …'];
@@ -204,15 +206,9 @@ function happened(text) {
 }
 
 function values() {
-  if (!viewer?.cursor) return;
-  const [x, y] = viewer.cursor, {a, b} = viewer.pictures;
-  const text = picture => {
-    const found = picture?.at(x, y);
-    return found ? found.map(value => digits(value, 4)).join(' ') : picture?.bitmap ? 'when it rests' : '–';
-  };
-  $('values').value = `${x}, ${y}   A ${text(a)}${b ? `   B ${text(b)}` : ''}`;
-  const apart = b && a && compare(a, b);
-  $('apart').textContent = apart ? `mean |A − B| ${digits(apart.mean, 3)}` : '';
+  if (!viewer) return;
+  if (viewer.cursor) $('values').value = valuesAt(viewer.pictures, viewer.cursor);
+  $('apart').textContent = apart(viewer.pictures);
 }
 
 /* What can be done */
@@ -233,10 +229,7 @@ $('pause').addEventListener('click', () => {
   update();
 });
 $('help').addEventListener('click', () => $('keys').showModal());
-theme.install($('theme'), () => {
-  const colour = getComputedStyle($('canvas')).backgroundColor.match(/[\d.]+/g)?.slice(0, 3).map(part => part / 255);
-  if (colour) viewer?.set({surround: colour});
-});
+theme.install($('theme'), surround => viewer?.set({surround}));
 if (viewer) {
   $('keylist').replaceChildren(...tools.listKeys());
   viewer.addEventListener('cursor', values);

@@ -41,12 +41,12 @@ export class Source {
   /** What `request` (of the upload's name) gives; an upload that is gone is sent again first. */
   async use(request, progress) {
     try {
-      return await request(encodeURIComponent(this.held.name));
+      return await request(this.held.name);
     } catch (error) {
       if (error.status !== 410) throw error;
       this.reopening ??= this.open(progress).finally(() => this.reopening = null);
       await this.reopening;
-      return request(encodeURIComponent(this.held.name));
+      return request(this.held.name);
     }
   }
 }

@@ -2,8 +2,11 @@
 
 const NAMES = {'': 'Auto', light: 'Light', dark: 'Dark'};
 
-/** Makes `button` turn from one to the next; `changed` hears of it, and of the system's changes. */
-export function install(button, changed) {
+/** Makes `button` turn from one to the next; `surround` hears what colour is around the picture then,
+ *  as three shares of 1, and when the system changes. */
+export function install(button, surround) {
+  const changed = () => surround(getComputedStyle(document.querySelector('.view')).backgroundColor
+    .match(/[\d.]+/g).slice(0, 3).map(part => part / 255));
   const order = Object.keys(NAMES);
   let theme = order.includes(read()) ? read() : '';
   const apply = () => {

@@ -13,16 +13,19 @@ export class Tools {
     Object.assign(this, {viewer, auto, touched: false, single: true, wipe: $('wipe')});
     this.selects = {a: this.select('A', choose), b: this.select('B', choose)};
     this.modes = el('fieldset', {className: 'modes'}, el('legend', {}, 'View'), ...MODES.map(mode =>
-      el('label', {}, el('input', {type: 'radio', name: 'mode', value: mode, checked: mode === 'a'}),
+      el('label', {}, el('input', {type: 'radio', name: 'mode', value: mode}),
         el('span', {}, MODE_NAMES[mode]))));
     this.modes.addEventListener('change', event => this.mode(event.target.value));
-    this.exposure = el('input', {type: 'range', min: -EXPOSURES, max: EXPOSURES, step: .1, value: 0, 'aria-label': 'Exposure in stops'});
+    this.exposure = el('input', {type: 'range', min: -EXPOSURES, max: EXPOSURES, step: .1, value: 0,
+      'aria-label': 'Exposure in stops'});
     this.stops = el('output', {className: 'stops'});
     this.exposure.addEventListener('input', () => this.expose(Number(this.exposure.value), true));
     this.exposure.addEventListener('dblclick', () => this.expose(0, true));
-    const automatic = el('button', {type: 'button', title: 'The brightest percent becomes white (E)'}, 'Auto');
+    const automatic = el('button', {type: 'button', title: 'The brightest percent becomes white (E)'},
+      'Auto');
     automatic.addEventListener('click', () => this.expose(auto(), true));
-    this.curve = el('select', {'aria-label': 'Tone curve'}, ...CURVES.map((name, value) => el('option', {value}, name)));
+    this.curve = el('select', {'aria-label': 'Tone curve'},
+      ...CURVES.map((name, value) => el('option', {value}, name)));
     this.curve.addEventListener('change', () => viewer.set({curve: Number(this.curve.value)}));
     const zoom = (text, label, act) => {
       const button = el('button', {type: 'button', title: label, 'aria-label': label}, text);
@@ -32,7 +35,8 @@ export class Tools {
     this.level = el('output', {className: 'level'});
     root.append(
       el('div', {className: 'group sides'}, this.selects.a.label, this.modes, this.selects.b.label),
-      el('div', {className: 'group'}, el('span', {className: 'word'}, 'EV'), this.exposure, this.stops, automatic, this.curve));
+      el('div', {className: 'group'}, el('span', {className: 'word'}, 'EV'), this.exposure, this.stops,
+        automatic, this.curve));
     $('zoom').append(
       zoom('−', 'Zoom out (−)', () => viewer.zoomTo(viewer.zoom / 2)), this.level,
       zoom('+', 'Zoom in (+)', () => viewer.zoomTo(viewer.zoom * 2)),
@@ -124,7 +128,8 @@ export class Tools {
     event.preventDefault();
     const from = viewer.cursor ?? [frame[0] + (frame[2] >> 1), frame[1] + (frame[3] >> 1)];
     const step = event.shiftKey ? 10 : 1;
-    viewer.point(from.map((p, i) => Math.max(frame[i], Math.min(frame[i] + frame[i + 2] - 1, p + by[i] * step))), true);
+    const inside = (p, i) => Math.max(frame[i], Math.min(frame[i] + frame[i + 2] - 1, p));
+    viewer.point(from.map((p, i) => inside(p + by[i] * step, i)), true);
   }
 
   /** Keys: what each does, and how. */
@@ -161,7 +166,8 @@ export class Tools {
 
   /** Rows for the list of keys. */
   listKeys() {
-    const rows = Object.entries(this.keys).filter(([, [text]]) => text).map(([key, [text]]) => [key.toUpperCase(), text]);
+    const rows = Object.entries(this.keys).filter(([, [text]]) => text)
+      .map(([key, [text]]) => [key.toUpperCase(), text]);
     rows.push(['Arrows', 'on the picture: to the next pixel, with Shift ten'], ['Wheel, pinch', 'zoom'],
       ['Drag', 'move'], ['Double click', 'near, and back']);
     return rows.flatMap(([key, text]) => [el('dt', {}, el('kbd', {}, key)), el('dd', {}, text)]);
