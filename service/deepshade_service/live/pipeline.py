@@ -105,6 +105,7 @@ class Pipeline:
         self._pending: tuple[live.Frame, float] | None = None
         self._arrived = asyncio.Event()
         self._decoded: asyncio.Queue[_Work | _Told] = asyncio.Queue(1)
+        self._about: dict[str, Any] = {}
         self._granted = False
         self._inferring = False
         self._settled: tuple[Asking, float] | None = None
@@ -167,6 +168,10 @@ class Pipeline:
                 nonfinite = int(made.facts["nonfinite_pixels"])
                 stages = {**made.milliseconds}
                 self._telemetry.shaded(made.effect, stages, made.pixels, made.computed, nonfinite)
+            self._session.take(answer)
+            if (about := self._session.about()) != self._about:
+                self._about = about
+                await self._say({"type": "about", "effects": about})
             if self._want is not None:
                 await self._outlet.offer(answer, self._want)
             await self._session.show(answer)
