@@ -32,6 +32,7 @@ from deepshade_service.live.answer import Answer, Want
 from deepshade_service.live.asking import Asking, Reader
 from deepshade_service.live.history import History
 from deepshade_service.live.session import Session
+from deepshade_service.live.trust import Trust
 from deepshade_service.live.viewer import Outlet
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.problems import Problem
@@ -105,6 +106,7 @@ class Pipeline:
         self._pending: tuple[live.Frame, float] | None = None
         self._arrived = asyncio.Event()
         self._decoded: asyncio.Queue[_Work | _Told] = asyncio.Queue(1)
+        self._trust = Trust()
         self._about: dict[str, Any] = {}
         self._granted = False
         self._inferring = False
@@ -208,7 +210,11 @@ class Pipeline:
         def load(_: threading.Event) -> tuple[list[GBuffer], Float | None]:
             with watch.time("decode"):
                 bundles = [job.bundle for job in jobs]
-                gbuffers = list(decode([picture], headers, bundles, asked, shader.limits))
+                gbuffers = self._trust.load(
+                    (frame.about["planes"], asking),
+                    asked,
+                    lambda how: list(decode([picture], headers, bundles, how, shader.limits)),
+                )
                 motion = None if self._history is None else _motion(picture, headers, asked)
                 return gbuffers, motion
 
