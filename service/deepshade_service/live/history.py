@@ -94,10 +94,14 @@ def _followed(
     """
     height, width = position.shape[1:]
     rows, columns = (grid.astype(np.float32) for grid in np.indices((height, width), np.int32))
-    known = camera is not None and before is not None
     expected, turned = -position[2], normal
     moved = False
-    if known and camera.world_to_camera is not None and before.world_to_camera is not None:
+    if (
+        camera is not None
+        and before is not None
+        and camera.world_to_camera is not None
+        and before.world_to_camera is not None
+    ):
         change = before.matrix @ np.linalg.inv(camera.matrix)
         moved = not np.allclose(change, np.eye(4), atol=1e-6)
         if moved:

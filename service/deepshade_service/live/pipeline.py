@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from deepshade import exr, live
 from deepshade.effects import SETTINGS
 from deepshade.errors import DeepshadeError
-from deepshade.gbuffer import GBuffer, load_gbuffers
+from deepshade.gbuffer import GBuffer, load_gbuffer
 from deepshade.gbuffer.conventions import Conventions
 from deepshade.gbuffer.plan import plan_gbuffer
 from deepshade_service import problems
@@ -306,13 +306,17 @@ def _motion(
 
     A picture's motion is that of its open shutter, which is so many frames.
     """
-    how = {"profile": asked.profile, "mapping": asked.mapping}
-    plan = plan_gbuffer(headers, [""], ["motion"], **how)
+    profile, mapping = asked.profile, asked.mapping
+    plan = plan_gbuffer(headers, [""], ["motion"], profile=profile, mapping=mapping)
     if "motion" not in plan.choices:
         return None
-    trusted = Conventions(checks="trust")
-    (gbuffer,) = load_gbuffers(
-        [("", picture.data)], [["motion"]], headers=headers, conventions=trusted, **how
+    gbuffer = load_gbuffer(
+        ("", picture.data),
+        ["motion"],
+        headers=headers,
+        conventions=Conventions(checks="trust"),
+        profile=profile,
+        mapping=mapping,
     )
     shutter = stored(gbuffer, SETTINGS["shutter"]) or 1.0
     return gbuffer.attributes["motion"] / np.float32(shutter)
