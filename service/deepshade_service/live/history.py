@@ -52,7 +52,8 @@ class History:
         """
         share = EFFECTS[effect].history
         position = _position(gbuffer)
-        if not share or position is None:
+        flat = gbuffer.camera is None or gbuffer.camera.projection == "perspective"
+        if not share or position is None or not flat:
             return shade
         depth = -position[2]
         normal = gbuffer.attributes.get("normal")
