@@ -2,7 +2,8 @@
 
 The checks of a G-buffer take longer than all else that is done to it. What they find is how its
 renderer stores values, and that stays. So a stream whose first frame comes out the same without
-them does without for a second, and then they look again.
+them does without for a second, and then they look again. Places in 16 bits are another matter: how
+coarse they are, and so whether they are repaired, differs from frame to frame.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from deepshade.gbuffer import GBuffer
 from deepshade_service.parameters import ShadeParameters
 
 _AGAIN = 1.0  # seconds
+_PLACES = ("position", "position_world", "depth", "distance")
 
 
 class Trust:
@@ -27,13 +29,14 @@ class Trust:
 
     def load(
         self,
-        key: object,
+        key: tuple[Sequence[Sequence[str]], object],
         asked: ShadeParameters,
         load: Callable[[ShadeParameters], list[GBuffer]],
     ) -> list[GBuffer]:
         """What `load` gives with these settings, as far as it can be known without the checks.
 
-        Raises what `load` raises.
+        `key` begins with the frame's planes, each [name, "half" or "float"]. Raises what `load`
+        raises.
         """
         if asked.strict or asked.trust:
             return load(asked)
@@ -44,9 +47,16 @@ class Trust:
         found = load(asked)
         if not looked:
             self._key = key
-            same = _same(found, load(trusting))
+            same = not _coarse(found, key[0]) and _same(found, load(trusting))
             self._until = time.monotonic() + _AGAIN if same else 0.0
         return found
+
+
+def _coarse(found: Sequence[GBuffer], planes: Sequence[Sequence[str]]) -> bool:
+    """Whether places come from planes of 16 bits."""
+    halves = {name for name, kind in planes if kind == "half"}
+    texts = (text for each in found for name, text in each.mapped.items() if name in _PLACES)
+    return any(name in text for text in texts for name in halves)
 
 
 def _same(some: Sequence[GBuffer], others: Sequence[GBuffer]) -> bool:
