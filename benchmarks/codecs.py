@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=1 python benchmarks/codecs.py samples/room.exr [more.exr]
 
 Each line is one codec on what a live frame holds: normals and light in 16 bits, depth in 32. The
-fastest of some rounds counts. "Soonest below" is the link below which a codec is sooner through than
-the one before it in the table, packing and unpacking included.
+fastest of some rounds counts. "Soonest below" is the link below which a codec is sooner through
+than the one before it in the table, packing and unpacking included.
 """
 
 from __future__ import annotations
