@@ -1,10 +1,10 @@
 """Codecs of live frames: bytes and seconds of the CPU, on the planes of real G-buffers.
 
-    OMP_NUM_THREADS=1 python benchmarks/codecs.py samples/room.exr [more.exr] [--markdown]
+    OMP_NUM_THREADS=1 python benchmarks/codecs.py samples/room.exr [more.exr]
 
 Each line is one codec on what a live frame holds: normals and light in 16 bits, depth in 32. The
-fastest of some rounds counts. `megabits` is the link below which a codec is sooner through than the
-one before it in the table.
+fastest of some rounds counts. "Soonest below" is the link below which a codec is sooner through
+than the one before it in the table, packing and unpacking included.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from deepshade import exr, live
 from deepshade.live import codecs
 
 ROUNDS = 5
+ORDER = ("raw", "lz4", "zstd", "deflate", "htj2k")
 
 
 def main() -> None:
@@ -36,7 +37,7 @@ def main() -> None:
     print("| codec | smaller by | bits a value | packs, MB/s | unpacks, MB/s | soonest below |")
     print("|---|---|---|---|---|---|")
     before: tuple[float, float] | None = None
-    for codec in live.available():
+    for codec in (name for name in ORDER if name in live.available()):
         blocks, packs = quickest(lambda codec=codec: [codecs.encode(p, codec) for p in planes])
         _, unpacks = quickest(
             lambda codec=codec, blocks=blocks: [

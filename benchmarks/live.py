@@ -55,7 +55,8 @@ def main() -> None:
     options = parser.parse_args()
     body = analytic_picture(512, 768)
     image = exr.read(body)
-    planes = {name: plane.astype("<f2") for name, plane in image.pixels.items()}
+    planes = {n: p.astype("<f2") for n, p in image.pixels.items() if n.startswith("normal")}
+    planes["Z"] = -image.pixels["position.Z"].astype("<f4")  # what an engine has
     picture = Picture(planes, {"deepshade:fov": 50.0})
     bundle = Bundle.load(options.models / "ao" / options.bundle)
     with Server(options.models, ("--threads", str(options.threads))) as server:

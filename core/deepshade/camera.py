@@ -181,15 +181,22 @@ class Camera:
 
         A latlong camera has no plane: its depth is the distance.
         """
+        depth = np.asarray(depth, np.float32)
         height, width = depth.shape
-        if self.projection == "orthographic":
-            out = np.empty((3, height, width), np.float32)
-            out[0], out[1] = self._slopes(np.arange(width), np.arange(height)[:, None])
-            np.negative(depth, out=out[2])
+        if self.projection == "latlong":
+            out = self.rays(width, height)
+            with np.errstate(invalid="ignore", over="ignore"):
+                out *= depth
             return out
-        out = self.rays(width, height)
-        with np.errstate(invalid="ignore", over="ignore"):  # 0 * inf on background pixels
-            out *= np.asarray(depth, np.float32)
+        x, y = self._slopes(np.arange(width), np.arange(height)[:, None])
+        out = np.empty((3, height, width), np.float32)
+        if self.projection == "orthographic":
+            out[0], out[1] = x, y
+        else:
+            with np.errstate(invalid="ignore", over="ignore"):  # 0 * inf on background pixels
+                np.multiply(depth, x.astype(np.float32), out=out[0])
+                np.multiply(depth, y.astype(np.float32), out=out[1])
+        np.negative(depth, out=out[2])
         return out
 
     def slant(self, width: int, height: int) -> NDArray[np.float32]:

@@ -186,6 +186,7 @@ def test_the_example_renderer_streams_into_files(server, tmp_path, capsys):
         assert main(["stream", "ao", "-", "-o", str(out), "--server", server, "--json"]) == 0
     picture = exr.read(tmp_path / "ao.0002.exr")
     assert picture.pixels["Y"].shape == (256, 384)
+    assert picture.header.parts[0].attributes["deepshade:bundle"] == "tiny"
     assert picture.header.parts[0].attributes["deepshade:fov"] == 50.0
     assert not list(tmp_path.glob(".*.tmp"))
 

@@ -8,6 +8,7 @@ import secrets
 import threading
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -104,29 +105,23 @@ async def _feed(
     options: Options | None,
 ) -> None:
     """Offer all pictures; files are read in threads, with the channels that are needed."""
-    how = {"mapping": options.mapping, "profile": options.profile} if options else {}
+    mapping = options.mapping if options else None
+    profile = options.profile if options else None
 
-    async def offer(picture: Picture | Path | str) -> None:
-        if not isinstance(picture, Picture):
-            needs = await asyncio.shield(publisher.inputs)
-            file = Path(picture)
-            picture = await asyncio.to_thread(
-                read_picture,
-                [file],
-                needs,
-                name=file.stem,
-                **how,  # type: ignore[arg-type]
-            )
-        await publisher.offer(picture)
+    async def offer(each: Picture | Path | str) -> None:
+        if not isinstance(each, Picture):
+            file, needs = Path(each), await asyncio.shield(publisher.inputs)
+            read = partial(read_picture, mapping=mapping, profile=profile, name=file.stem)
+            each = await asyncio.to_thread(read, [file], needs)
+        await publisher.offer(each)
 
     try:
         if isinstance(pictures, AsyncIterable):
-            async for each in pictures:
-                await offer(each)
+            async for picture in pictures:
+                await offer(picture)
         else:
-            iterator = iter(pictures)
-            end = object()
-            while (each := await asyncio.to_thread(next, iterator, end)) is not end:
-                await offer(each)  # type: ignore[arg-type]
+            left = iter(pictures)
+            while (found := await asyncio.to_thread(next, left, None)) is not None:
+                await offer(found)
     finally:
         publisher.finish()

@@ -29,7 +29,7 @@ _HEAD = struct.Struct("<4s4B4I2d")
 _SIZE = struct.Struct("<I")
 _MAX_JSON = 2**16
 _MAX_TEXT = 1000
-_KINDS = {"half": np.dtype("<f2"), "float": np.dtype("<f4")}
+_KINDS: dict[str, np.dtype[Any]] = {"half": np.dtype("<f2"), "float": np.dtype("<f4")}
 _SHAPES = {2: (2,), 3: (3,), 9: (3, 3), 16: (4, 4)}
 
 
@@ -149,7 +149,8 @@ def parse(data: bytes, limits: Limits) -> Frame:
     end = _HEAD.size + size
     about = _object(data[_HEAD.size : end])
     name = codecs.NAMES[codec]
-    view, blocks = memoryview(data), []
+    view = memoryview(data)
+    blocks: list[memoryview] = []
     while end < len(data):
         if end + _SIZE.size > len(data):
             raise FrameError("the frame ends within a plane's size")

@@ -17,7 +17,7 @@ from deepshade_service.problems import Problem
 from deepshade_service.selection import Candidate, allowed
 
 # of files, not of frames
-_NOT_LIVE = ("format", "compression", "half", "append", "layer", "multiply", "explain")
+_NOT_LIVE = ("upload", "format", "compression", "half", "append", "layer", "multiply", "explain")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +72,13 @@ class Reader:
             parameters = ShadeParameters.model_validate(settings)
         except ValidationError as error:
             raise problems.invalid(error.errors(), ShadeParameters.model_fields) from None
+        if len(parameters.views) > 1:
+            raise Problem(
+                422,
+                "bad-parameter",
+                "view: a live frame is of one view",
+                fix="name one, or stream each in a session of its own",
+            )
         candidates = [allowed(self._models, effect.name, parameters) for effect in effects]
         parameters.check(effects)
         return Asking(names, tuple(effects), parameters, candidates)

@@ -52,7 +52,8 @@ class History:
         """
         share = EFFECTS[effect].history
         position = _position(gbuffer)
-        if not share or position is None:
+        flat = gbuffer.camera is None or gbuffer.camera.projection == "perspective"
+        if not share or position is None or not flat:
             return shade
         depth = -position[2]
         normal = gbuffer.attributes.get("normal")
@@ -94,10 +95,14 @@ def _followed(
     """
     height, width = position.shape[1:]
     rows, columns = (grid.astype(np.float32) for grid in np.indices((height, width), np.int32))
-    known = camera is not None and before is not None
     expected, turned = -position[2], normal
     moved = False
-    if known and camera.world_to_camera is not None and before.world_to_camera is not None:
+    if (
+        camera is not None
+        and before is not None
+        and camera.world_to_camera is not None
+        and before.world_to_camera is not None
+    ):
         change = before.matrix @ np.linalg.inv(camera.matrix)
         moved = not np.allclose(change, np.eye(4), atol=1e-6)
         if moved:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from deepshade import exr, live
 from deepshade.effects import SETTINGS
 from deepshade.errors import DeepshadeError
-from deepshade.gbuffer import GBuffer, load_gbuffers
+from deepshade.gbuffer import GBuffer, load_gbuffer
 from deepshade.gbuffer.conventions import Conventions
 from deepshade.gbuffer.plan import plan_gbuffer
 from deepshade_service import problems
@@ -32,6 +32,7 @@ from deepshade_service.live.answer import Answer, Want
 from deepshade_service.live.asking import Asking, Reader
 from deepshade_service.live.history import History
 from deepshade_service.live.session import Session
+from deepshade_service.live.trust import Trust
 from deepshade_service.live.viewer import Outlet
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.problems import Problem
@@ -105,6 +106,8 @@ class Pipeline:
         self._pending: tuple[live.Frame, float] | None = None
         self._arrived = asyncio.Event()
         self._decoded: asyncio.Queue[_Work | _Told] = asyncio.Queue(1)
+        self._trust = Trust()
+        self._about: dict[str, Any] = {}
         self._granted = False
         self._inferring = False
         self._settled: tuple[Asking, float] | None = None
@@ -167,6 +170,10 @@ class Pipeline:
                 nonfinite = int(made.facts["nonfinite_pixels"])
                 stages = {**made.milliseconds}
                 self._telemetry.shaded(made.effect, stages, made.pixels, made.computed, nonfinite)
+            self._session.take(answer)
+            if (about := self._session.about()) != self._about:
+                self._about = about
+                await self._say({"type": "about", "effects": about})
             if self._want is not None:
                 await self._outlet.offer(answer, self._want)
             await self._session.show(answer)
@@ -203,7 +210,11 @@ class Pipeline:
         def load(_: threading.Event) -> tuple[list[GBuffer], Float | None]:
             with watch.time("decode"):
                 bundles = [job.bundle for job in jobs]
-                gbuffers = list(decode([picture], headers, bundles, asked, shader.limits))
+                gbuffers = self._trust.load(
+                    (frame.about["planes"], asking),
+                    asked,
+                    lambda how: list(decode([picture], headers, bundles, how, shader.limits)),
+                )
                 motion = None if self._history is None else _motion(picture, headers, asked)
                 return gbuffers, motion
 
@@ -295,13 +306,17 @@ def _motion(
 
     A picture's motion is that of its open shutter, which is so many frames.
     """
-    how = {"profile": asked.profile, "mapping": asked.mapping}
-    plan = plan_gbuffer(headers, [""], ["motion"], **how)
+    profile, mapping = asked.profile, asked.mapping
+    plan = plan_gbuffer(headers, [""], ["motion"], profile=profile, mapping=mapping)
     if "motion" not in plan.choices:
         return None
-    trusted = Conventions(checks="trust")
-    (gbuffer,) = load_gbuffers(
-        [("", picture.data)], [["motion"]], headers=headers, conventions=trusted, **how
+    gbuffer = load_gbuffer(
+        ("", picture.data),
+        ["motion"],
+        headers=headers,
+        conventions=Conventions(checks="trust"),
+        profile=profile,
+        mapping=mapping,
     )
     shutter = stored(gbuffer, SETTINGS["shutter"]) or 1.0
     return gbuffer.attributes["motion"] / np.float32(shutter)

@@ -142,7 +142,7 @@ async def _publish(connection: Connection, name: str, service: Service, sessions
             listening,
             pipeline.run(),
             connection.compare_clocks(),
-            _report(connection, session, outlet),
+            _report(connection, session, outlet, about=False),
             replaced.wait(),
         )
     finally:
@@ -218,14 +218,19 @@ async def _watch(connection: Connection, viewer: Viewer) -> None:
             viewer.outlet.acknowledge(message.get("id"))
 
 
-async def _report(connection: Connection, session: Session, outlet: Outlet) -> None:
-    """Say each second how it goes, and how answers are made when that has changed."""
-    sent, told = outlet.sent_bytes, {}
+async def _report(
+    connection: Connection, session: Session, outlet: Outlet, *, about: bool = True
+) -> None:
+    """Say each second how it goes, and how answers are made when that has changed.
+
+    A publisher hears that before the answer.
+    """
+    sent = outlet.sent_bytes
+    told: dict[str, Any] = {}
     while True:
-        about = session.about()
-        if about and about != told:
-            told = about
-            await connection.say({"type": "about", "effects": about})
+        if about and (plans := session.about()) and plans != told:
+            told = plans
+            await connection.say({"type": "about", "effects": plans})
         await connection.say(session.status(outlet.sent_bytes - sent))
         sent = outlet.sent_bytes
         await asyncio.sleep(_STATUS)

@@ -77,12 +77,15 @@ class Session:
         self._resting: asyncio.TimerHandle | None = None
         self._tasks: set[asyncio.Task[None]] = set()
 
-    async def show(self, answer: Answer) -> None:
-        """To all viewers; those that are behind get it in place of an older one."""
+    def take(self, answer: Answer) -> None:
+        """The newest answer."""
         self.meter.answered(time.time() - answer.made_at)
         answer.dropped = self.meter.dropped
         self.last, self.effects = answer, list(answer.shades)
         self.plans = {made.effect: made.plan for made in answer.made}
+
+    async def show(self, answer: Answer) -> None:
+        """To all viewers; those that are behind get it in place of an older one."""
         for viewer in list(self.viewers):
             await viewer.offer(answer, rest=answer.rest)
         if self._resting is not None:
