@@ -170,7 +170,8 @@ def all_graphs() -> tuple[onnx.ModelProto, dict[str, int]]:
         given |= {f"{name}//from": ints(start), f"{name}//to": ints(stop)}
         given |= {f"{name}//shape": ints(*shape), f"{name}//flat": ints(-1)}
         weights += [numpy_helper.from_array(array, key) for key, array in given.items()]
-        nodes.append(helper.make_node("Slice", ["x", f"{name}//from", f"{name}//to"], [f"{name}//s"]))
+        ends = [f"{name}//from", f"{name}//to"]
+        nodes.append(helper.make_node("Slice", ["x", *ends], [f"{name}//s"]))
         nodes.append(helper.make_node("Reshape", [f"{name}//s", f"{name}//shape"], [f"{name}/x"]))
         for inner in each:
             copied = onnx.NodeProto()
