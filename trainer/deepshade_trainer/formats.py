@@ -70,6 +70,7 @@ def _onnx(
     typer.echo(
         f"{made.path}: {sum(made.operators.values())} nodes of {len(made.operators)} kinds, opset "
         f"{opset}; ONNX Runtime's answers are within {made.difference:.0e} of the bundle's"
+        f"{'' if precision == 'fp32' else ' on average'}"
     )
     typer.echo(", ".join(f"{count} {name}" for name, count in made.operators.most_common()))
     for taker in made.takers:
