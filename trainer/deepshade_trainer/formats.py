@@ -100,7 +100,7 @@ def _npz(bundle: Bundle, folder: Path) -> None:
     from onnx.numpy_helper import to_array
 
     graph = plain(bundle).graph
-    weights = {tensor.name: to_array(tensor) for tensor in graph.initializer}
+    weights: dict[str, Any] = {tensor.name: to_array(tensor) for tensor in graph.initializer}
     nodes = [
         {
             "operator": node.op_type,
@@ -114,7 +114,7 @@ def _npz(bundle: Bundle, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{bundle.effect}-{bundle.name}.npz"
     with replacing(path) as part, part.open("wb") as file:
-        np.savez(file, **{"deepshade": np.array(json.dumps(document)), **weights})
+        np.savez(file, deepshade=np.array(json.dumps(document)), **weights)
     count = sum(each.size for each in weights.values())
     typer.echo(f"{path}: {len(weights)} arrays of {count} numbers; {len(nodes)} nodes")
 

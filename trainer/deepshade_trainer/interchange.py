@@ -210,7 +210,7 @@ def _refused(model: Any, opset: int) -> str:
 
 
 def _difference(bundle: Bundle, path: Path, size: Size | None) -> NDArray[np.float32]:
-    """Differences of ONNX Runtime's answers by the two graphs on noise, of values over 1 relative."""
+    """How far ONNX Runtime's answers by the two lie apart on noise, of values over 1 relative."""
     side = up(_FREE_SIDE, bundle.size_multiple)
     width, height = size or (side + bundle.size_multiple, side)
     picture = noise(bundle, height, width)[:1]
