@@ -93,9 +93,7 @@ def main():
     renderer = program.gl.info["GL_RENDERER"]
     software = "llvmpipe" in renderer or "softpipe" in renderer
     time = "no GPU" if software else f"{program.milliseconds():.2f} ms"
-    print(
-        f"{target}: {shade.shape[1]} x {shade.shape[0]}, mean {shade.mean():.4f}, {renderer}, {time}"
-    )
+    print(f"{target}: mean {shade.mean():.4f}, {renderer}, {time}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade.errors import DataError
+from deepshade.errors import DataError, EngineError
 
 Float = NDArray[np.float32]
 ROW = 512  # numbers in a row of an array texture, and rows in a layer
@@ -55,14 +55,29 @@ class _Program:
         return found
 
 
+def gl_context(version: int) -> Any:
+    """OpenGL of a version (430 is 4.3) without a window, through EGL.
+
+    Raises EngineError: there is none.
+    """
+    import moderngl
+
+    how: Any = {"backend": "egl"}  # by moderngl's types it could be no string
+    try:
+        return moderngl.create_context(standalone=True, require=version, **how)
+    except Exception as error:  # whatever EGL and its driver think of
+        raise EngineError(
+            f"no OpenGL {version // 100}.{version // 10 % 10} by EGL here: {error}",
+            fix="install a driver; Debian's in software: apt-get install libegl1 libgl1-mesa-dri",
+        ) from error
+
+
 class GlCompute:
     """GLSL compute shaders on OpenGL 4.3, through EGL."""
 
     def __init__(self, folder: Path) -> None:
-        import moderngl
-
         program = self.program = _Program(folder)
-        self.gl = moderngl.create_context(standalone=True, require=430, backend="egl")
+        self.gl = gl_context(430)
         self.shaders = {
             name: self.gl.compute_shader((folder / f"{name}.comp").read_text("utf-8"))
             for name in program.kernels
@@ -88,10 +103,8 @@ class GlFragment:
     """GLSL fragment shaders on OpenGL 3.3, through EGL: buffers are array textures."""
 
     def __init__(self, folder: Path) -> None:
-        import moderngl
-
         program = self.program = _Program(folder)
-        self.gl = moderngl.create_context(standalone=True, require=330, backend="egl")
+        self.gl = gl_context(330)
         stages = [(folder / f"layers.{each}").read_text("utf-8") for each in ("vert", "geom")]
         self.arrays, self.shaders = {}, {}
         for name in program.kernels:
@@ -143,6 +156,11 @@ class WebGpu:
         import wgpu
 
         program = self.program = _Program(folder)
+        if not wgpu.gpu.enumerate_adapters_sync():
+            raise EngineError(
+                "no Vulkan, Metal or Direct3D here for WebGPU",
+                fix="install a driver; Debian's in software: apt-get install mesa-vulkan-drivers",
+            )
         adapter = wgpu.gpu.request_adapter_sync(power_preference="high-performance")
         most = adapter.limits["max-storage-buffer-binding-size"]
         self.device = adapter.request_device_sync(

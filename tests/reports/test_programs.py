@@ -13,6 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from deepshade import tensors
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
+from deepshade.errors import EngineError
 from deepshade.gbuffer import load_gbuffer
 from deepshade_report import programs
 from deepshade_trainer.graph import session
@@ -32,19 +33,13 @@ RUNNERS = {
 
 def runner(kind: str, folder: Path) -> programs.Runner:
     """Skips where the machine has no such API, software renderers included."""
-    if kind in ("compute", "fragment"):
-        moderngl = pytest.importorskip("moderngl")
-        try:
-            moderngl.create_context(standalone=True, require=430, backend="egl").release()
-        except Exception as error:
-            pytest.skip(f"no OpenGL 4.3 by EGL (Debian: libegl1 libgl1-mesa-dri): {error}")
-    else:
-        wgpu = pytest.importorskip("wgpu")
-        if not wgpu.gpu.enumerate_adapters_sync():
-            pytest.skip("no adapter for WebGPU (Debian: mesa-vulkan-drivers)")
-        if kind == "hlsl" and shutil.which(programs.GLSLANG) is None:
-            pytest.skip("no glslangValidator (Debian: glslang-tools)")
-    return RUNNERS[kind][1](folder)
+    pytest.importorskip("moderngl" if RUNNERS[kind][0] == "glsl" else "wgpu")
+    if kind == "hlsl" and shutil.which(programs.GLSLANG) is None:
+        pytest.skip("no glslangValidator (Debian: glslang-tools)")
+    try:
+        return RUNNERS[kind][1](folder)
+    except EngineError as error:
+        pytest.skip(str(error))
 
 
 def node(kind: str, inputs: str, output: str = "y", **attributes: object) -> onnx.NodeProto:
@@ -170,7 +165,8 @@ def all_graphs() -> tuple[onnx.ModelProto, dict[str, int]]:
         given |= {f"{name}//from": ints(start), f"{name}//to": ints(stop)}
         given |= {f"{name}//shape": ints(*shape), f"{name}//flat": ints(-1)}
         weights += [numpy_helper.from_array(array, key) for key, array in given.items()]
-        nodes.append(helper.make_node("Slice", ["x", f"{name}//from", f"{name}//to"], [f"{name}//s"]))
+        ends = [f"{name}//from", f"{name}//to"]
+        nodes.append(helper.make_node("Slice", ["x", *ends], [f"{name}//s"]))
         nodes.append(helper.make_node("Reshape", [f"{name}//s", f"{name}//shape"], [f"{name}/x"]))
         for inner in each:
             copied = onnx.NodeProto()

@@ -14,8 +14,10 @@ from deepshade.bundles import Bundle
 from deepshade.cli import main
 from deepshade.effects import EFFECTS
 from deepshade.gbuffer import load_gbuffer
+from deepshade_trainer.dialects import easier
 from deepshade_trainer.graph import session
 from deepshade_trainer.interchange import write_plain
+from deepshade_trainer.takers import takers
 
 ROOT = Path(__file__).resolve().parents[2]
 MODELS = ROOT / "models"
@@ -57,6 +59,58 @@ def test_answers_are_the_bundles(name: str, size: tuple[int, int] | None, tmp_pa
     assert set(json.loads(facts["deepshade:float32"])) <= known
 
 
+@pytest.mark.slow
+def test_16_bits_and_an_input_for_each_attribute(tmp_path: Path) -> None:
+    bundle = Bundle.load(MODELS / "ao/fast")
+    made = write_plain(bundle, tmp_path, (WIDTH, HEIGHT), 15, "fp16", apart=True)
+    model = onnx.load(str(made.path))
+    onnx.checker.check_model(model, full_check=True)
+    kinds = {each.data_type for each in model.graph.initializer if len(each.dims) == 4}
+    assert kinds == {onnx.TensorProto.FLOAT16}
+    given = gbuffer(bundle)
+    apart = {"normal": given[:, :3], "position": given[:, 3:]}
+    answer = session(made.path).run(None, apart)[0]
+    expected = session(bundle.model).run(None, {"gbuffer": given})[0]
+    assert answer.dtype == np.float32
+    assert 0 < np.abs(answer - expected).max() < 0.005
+    assert {each.engine: each.takes for each in made.takers}["Unity Inference Engine"] is False
+
+
+def test_what_engines_get_wrong_is_said_otherwise() -> None:
+    helper = onnx.helper
+    rng = np.random.default_rng(0)
+    weights = {
+        "six": rng.normal(size=(4, 6, 3, 3)).astype(np.float32),
+        "three": rng.normal(size=(2, 3, 2, 2)).astype(np.float32),
+    }
+    nodes = [
+        helper.make_node(
+            "AveragePool", ["x"], ["p"], kernel_shape=[3, 3], pads=[1, 0, 2, 1], count_include_pad=1
+        ),
+        helper.make_node("Conv", ["p", "six"], ["a"], pads=[1, 1, 1, 1]),
+        helper.make_node("Split", ["p"], ["q", "r"], axis=1, num_outputs=2),
+        helper.make_node("Conv", ["q", "three"], ["b"], pads=[0, 1, 0, 1], strides=[1, 1]),
+        helper.make_node("Concat", ["a", "a"], ["y"], axis=1),
+    ]
+    x = helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 6, 8, 9])
+    outputs = [helper.make_tensor_value_info(n, onnx.TensorProto.FLOAT, None) for n in ("y", "b")]
+    known = [onnx.numpy_helper.from_array(array, name) for name, array in weights.items()]
+    graph = helper.make_graph(nodes, "one", [x], outputs, known)
+    opsets = [helper.make_opsetid("", 18)]
+    model = helper.make_model(graph, opset_imports=opsets, ir_version=10)
+    given = {"x": rng.normal(size=(1, 6, 8, 9)).astype(np.float32)}
+    expected = session(model.SerializeToString()).run(None, given)
+    unity = takers(model)[0]
+    assert not unity.takes
+    assert "count_include_pad" in unity.note
+    answer = session(easier(model).SerializeToString()).run(None, given)
+    for ours, theirs in zip(answer, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    assert takers(model)[0].takes
+    widths = [t.dims[1] for t in model.graph.initializer if t.name in weights]
+    assert widths == [8, 3]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -64,6 +118,7 @@ def test_answers_are_the_bundles(name: str, size: tuple[int, int] | None, tmp_pa
         (["ao/fast", "--size", "big"], "give WxH"),
         (["ao/fast", "--opset", "12"], "from 13 to 18"),
         (["ibl/balanced", "--opset", "13"], "the lowest for this graph is 16"),
+        (["ibl/balanced", "--precision", "fp16"], "needs float32; export it as fp32"),
     ],
 )
 def test_what_can_not_be_is_said(

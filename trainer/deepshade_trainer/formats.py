@@ -70,6 +70,7 @@ def _onnx(
     typer.echo(
         f"{made.path}: {sum(made.operators.values())} nodes of {len(made.operators)} kinds, opset "
         f"{opset}; ONNX Runtime's answers are within {made.difference:.0e} of the bundle's"
+        f"{'' if precision == 'fp32' else ' on average'}"
     )
     typer.echo(", ".join(f"{count} {name}" for name, count in made.operators.most_common()))
     for taker in made.takers:
@@ -99,7 +100,7 @@ def _npz(bundle: Bundle, folder: Path) -> None:
     from onnx.numpy_helper import to_array
 
     graph = plain(bundle).graph
-    weights = {tensor.name: to_array(tensor) for tensor in graph.initializer}
+    weights: dict[str, Any] = {tensor.name: to_array(tensor) for tensor in graph.initializer}
     nodes = [
         {
             "operator": node.op_type,
@@ -113,7 +114,7 @@ def _npz(bundle: Bundle, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{bundle.effect}-{bundle.name}.npz"
     with replacing(path) as part, part.open("wb") as file:
-        np.savez(file, **{"deepshade": np.array(json.dumps(document)), **weights})
+        np.savez(file, deepshade=np.array(json.dumps(document)), **weights)
     count = sum(each.size for each in weights.values())
     typer.echo(f"{path}: {len(weights)} arrays of {count} numbers; {len(nodes)} nodes")
 

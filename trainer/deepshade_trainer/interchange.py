@@ -28,8 +28,9 @@ from deepshade_trainer.takers import Taker, takers
 
 OPSETS = range(13, 19)
 LICENCE = "Apache-2.0"
-# between the graph and the bundle's own, of values up to 1, or of the value
-TOLERANCES = {"fp32": 1e-6, "fp16": 0.02}
+# Between the graph and the bundle's own, of values up to 1, or of the value. With fp16 on average:
+# on noise, which has no surfaces, single pixels flip.
+TOLERANCES = {"fp32": 1e-6, "fp16": 2e-3}
 _FREE_SIDE = 128  # of the picture that a graph of any size is compared on
 
 Size = tuple[int, int]  # width, height
@@ -39,7 +40,8 @@ Precision = Literal["fp32", "fp16"]
 @dataclass(frozen=True, slots=True)
 class Plain:
     """A graph that was written: its operators with how often each is there, how far ONNX
-    Runtime's answers by it lie from those by the bundle's own, and which engines take it."""
+    Runtime's answers by it lie from those by the bundle's own (at most; with fp16 on average), and
+    which engines take it."""
 
     path: Path
     operators: Counter[str]
@@ -85,7 +87,8 @@ def write_plain(
         _set_opset(model, opset)
         onnx.helper.set_model_props(model, facts(bundle))
         onnx.save(model, str(temporary))
-        difference = _difference(bundle, temporary, size)
+        apart_by = _difference(bundle, temporary, size)
+        difference = float(apart_by.max() if precision == "fp32" else apart_by.mean())
         if not difference <= TOLERANCES[precision]:
             raise DataError(
                 f"by the graph made of {bundle.model} ONNX Runtime's answer differs by "
@@ -206,8 +209,8 @@ def _refused(model: Any, opset: int) -> str:
     return ""
 
 
-def _difference(bundle: Bundle, path: Path, size: Size | None) -> float:
-    """Largest difference of ONNX Runtime's answers by the two graphs, of values over 1 relative."""
+def _difference(bundle: Bundle, path: Path, size: Size | None) -> NDArray[np.float32]:
+    """How far ONNX Runtime's answers by the two lie apart on noise, of values over 1 relative."""
     side = up(_FREE_SIDE, bundle.size_multiple)
     width, height = size or (side + bundle.size_multiple, side)
     picture = noise(bundle, height, width)[:1]
@@ -219,7 +222,7 @@ def _difference(bundle: Bundle, path: Path, size: Size | None) -> float:
         given |= prepared.inputs(bundle.environment, 30.0, "y", lambda: np.eye(3))
     theirs, ours = (_answer(graph, given) for graph in (bundle.model, path))
     apart: NDArray[np.float32] = np.abs(ours - theirs) / np.maximum(1, np.abs(theirs))
-    return float(apart.max())
+    return apart
 
 
 def _answer(graph: Path, given: Mapping[str, NDArray[np.float32]]) -> NDArray[np.float32]:

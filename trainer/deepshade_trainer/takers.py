@@ -36,7 +36,7 @@ def takers(model: Any) -> list[Taker]:
     if half:
         wrong.append("no 16-bit floats among its types")
     slow = sorted(kinds & _WEBGPU_LACKS)
-    beside = f"on WebGPU but for {', '.join(slow)}, which run in WebAssembly" if slow else ""
+    beside = f"on WebGPU, and in WebAssembly what that lacks: {', '.join(slow)}" if slow else ""
     return [
         Taker("Unity Inference Engine", not wrong, ", ".join(dict.fromkeys(wrong))),
         Taker("Unreal NNE (NNERuntimeORT)", True),

@@ -258,7 +258,7 @@ def _pads_and_steps(given: Given, x: View, high: int, wide: int) -> tuple[Axis, 
 
 def _planes(x: View, channels: int, high: int, wide: int) -> Numbers:
     """The sizes of what is made, and where the planes of `x` (N, C, H, W) are."""
-    sizes = {8: channels, 9: high, 10: wide, 18: x.shape[2], 19: x.shape[3], 21: x.offset}
+    sizes: Numbers = {8: channels, 9: high, 10: wide, 18: x.shape[2], 19: x.shape[3], 21: x.offset}
     return sizes | {22 + k: stride for k, stride in enumerate(x.strides)}
 
 
