@@ -44,7 +44,7 @@ from deepshade_trainer.validation import validated
 
 Event = dict[str, Any]
 
-RATE = 4e-4  # of a preset's learning rate of 2e-3: what a base knows is kept, and yet it moves
+RATE = 8e-4  # of 2e-3, from which networks begin: what a base knows is kept, and yet it moves
 EMA = 0.95
 VALIDATIONS, SAVES = 12, 25  # in a job, at most about
 PILOT = 4  # steps, of which the first is not timed
