@@ -13,8 +13,17 @@ from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS
 from deepshade.errors import BundleError
 from deepshade_service.changes import Changes
+from deepshade_service.described import errors
 from deepshade_service.models import Models, not_ready
 from deepshade_service.problems import Problem
+
+_CHANGES = {
+    401: "The service's token is needed",
+    403: "Without a token this is for the service's own machine",
+    404: "No such bundle, or it has no versions",
+    409: "It can't be loaded: what answered goes on",
+    503: "The bundles aren't verified yet",
+}
 
 
 def guarded(method: str, path: str) -> bool:
@@ -30,12 +39,22 @@ def install(app: FastAPI, models: Models) -> None:
         if not models.loaded:
             raise not_ready(models)
 
-    @app.get("/bundles", tags=["bundles"], summary="All bundles, with their versions")
+    @app.get(
+        "/bundles",
+        tags=["bundles"],
+        summary="All bundles, with their versions",
+        responses=errors({}),
+    )
     async def listed() -> list[dict[str, Any]]:
         """`number` is the version that answers, where a bundle has versions."""
         return [describe(bundle) for e in EFFECTS for bundle in models.bundles(e)]
 
-    @app.post("/bundles/reload", tags=["bundles"], summary="Look at the folders again")
+    @app.post(
+        "/bundles/reload",
+        tags=["bundles"],
+        summary="Look at the folders again",
+        responses=errors(_CHANGES),
+    )
     async def reload() -> dict[str, Any]:
         """What changed is loaded and tried out before it answers. Whatever can't be loaded is
         refused with a 409, and what answered before goes on."""
@@ -52,7 +71,12 @@ def install(app: FastAPI, models: Models) -> None:
             )
         return {"changed": changed}
 
-    @app.post("/bundles/{effect}/{name}/pin", tags=["bundles"], summary="Stay at one version")
+    @app.post(
+        "/bundles/{effect}/{name}/pin",
+        tags=["bundles"],
+        summary="Stay at one version",
+        responses=errors(_CHANGES | {422: "No number of a version"}),
+    )
     async def pin(effect: str, name: str, version: Annotated[int, Query(ge=1)]) -> dict[str, Any]:
         """It is loaded and tried out first. Nothing that is published moves the alias then."""
         ready()
@@ -61,14 +85,24 @@ def install(app: FastAPI, models: Models) -> None:
         await asyncio.to_thread(alias.pin, version)
         return described(models, effect, name)
 
-    @app.delete("/bundles/{effect}/{name}/pin", tags=["bundles"], summary="Follow again")
+    @app.delete(
+        "/bundles/{effect}/{name}/pin",
+        tags=["bundles"],
+        summary="Follow again",
+        responses=errors(_CHANGES),
+    )
     async def unpin(effect: str, name: str) -> dict[str, Any]:
         """What is published next moves the alias again; until then it stays."""
         alias = changes.alias(effect, name)
         await asyncio.to_thread(alias.pin, None)
         return described(models, effect, name)
 
-    @app.post("/bundles/{effect}/{name}/rollback", tags=["bundles"], summary="Go back by one")
+    @app.post(
+        "/bundles/{effect}/{name}/rollback",
+        tags=["bundles"],
+        summary="Go back by one",
+        responses=errors(_CHANGES),
+    )
     async def rollback(effect: str, name: str) -> dict[str, Any]:
         """To the version before the one that answers, loaded and tried out first. A pin is lost."""
         ready()

@@ -17,6 +17,7 @@ from deepshade.errors import DeepshadeError
 from deepshade.gbuffer import channels as naming
 from deepshade.gbuffer.channels import Layer
 from deepshade.gbuffer.plan import Plan, plan_gbuffer
+from deepshade_service.described import errors
 from deepshade_service.memory import bytes_to_read
 from deepshade_service.models import Models
 from deepshade_service.problems import Problem
@@ -29,6 +30,14 @@ _ORDER = "rgbxyzuvwta"  # of a layer's components
 _MOST = 4  # channels of a layer that are shown
 _LONGEST = 200  # characters of a header's text that is repeated
 _PREFIX = "reference_"
+_KEPT = {
+    400: "A damaged file",
+    404: "No such upload or layer",
+    410: "It is no longer kept: send it again",
+    413: "Over a limit",
+    422: "A file that can't be read as a picture",
+    429: "The queue is full; see Retry-After",
+}
 
 
 def install(app: FastAPI, service: Service) -> None:
@@ -41,12 +50,23 @@ def install(app: FastAPI, service: Service) -> None:
             found = await workers.run(lambda _: describe(files, models, limits))
         return {"name": name, **found}
 
-    @app.get("/samples", tags=["uploads"], summary="Pictures to try everything with")
+    @app.get(
+        "/samples",
+        tags=["uploads"],
+        summary="Pictures to try everything with",
+        responses=errors({}),
+    )
     async def samples() -> list[str]:
         """Names for `?upload=` and `/uploads/{name}`."""
         return kept.samples
 
-    @app.post("/uploads", tags=["uploads"], summary="Keep a picture for a while", status_code=201)
+    @app.post(
+        "/uploads",
+        tags=["uploads"],
+        summary="Keep a picture for a while",
+        status_code=201,
+        responses=errors({422: "A file that can't be read as a picture"}, uploads=True),
+    )
     async def add(request: Request) -> dict[str, Any]:
         """The body is as that of `/shade`. The answer's `name` stands for it in `?upload=`, and the
         rest says what the picture holds. It is kept for some minutes after its last use, unless
@@ -58,7 +78,12 @@ def install(app: FastAPI, service: Service) -> None:
             kept.add(name, files)
         return found
 
-    @app.get("/uploads/{name}", tags=["uploads"], summary="What a kept picture holds")
+    @app.get(
+        "/uploads/{name}",
+        tags=["uploads"],
+        summary="What a kept picture holds",
+        responses=errors(_KEPT),
+    )
     async def one(name: str) -> dict[str, Any]:
         """Its layers in order, and what each effect lacks (nothing, if it can be shaded)."""
         with kept.use(name) as files:
@@ -69,7 +94,7 @@ def install(app: FastAPI, service: Service) -> None:
         tags=["uploads"],
         summary="One layer's pixels",
         response_class=Response,
-        responses={200: {"content": {"image/x-exr": {}}}},
+        responses={200: {"content": {"image/x-exr": {}}}} | errors(_KEPT),
     )
     async def layer(name: str, index: int) -> Response:
         """An uncompressed EXR of `Y`, or of `R G B A` as far as the layer has channels, in the

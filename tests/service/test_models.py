@@ -11,7 +11,7 @@ import pytest
 from deepshade.bundles import Bundle
 from deepshade.engines import REFERENCE, available, choose
 from deepshade_service import models as models_module
-from deepshade_service.models import Models
+from deepshade_service.models import Models, key_of
 from deepshade_service.parameters import ShadeParameters
 from deepshade_service.problems import Problem
 from deepshade_service.selection import allowed, select
@@ -245,7 +245,7 @@ def test_an_error_chooses_what_is_just_good_enough(three, loads):
 def test_a_time_chooses_the_most_accurate_that_keeps_it(three):
     speeds = {"fast": 10.0, "balanced": 100.0, "best": 1000.0}
     for bundle in three.find("ao"):
-        three._speeds[bundle.path, REFERENCE] = speeds[bundle.name]
+        three._speeds[*key_of(bundle), REFERENCE] = speeds[bundle.name]
     assert chosen(three, megapixels=0.5, budget_ms=500) == "best"
     assert chosen(three, megapixels=0.5, budget_ms=499) == "balanced"
     assert chosen(three, megapixels=0.5, budget_ms=5) == "fast"

@@ -14,6 +14,7 @@ from starlette.websockets import WebSocketDisconnect
 from deepshade import live
 from deepshade.errors import DeepshadeError
 from deepshade_service import problems
+from deepshade_service.described import errors
 from deepshade_service.live.answer import Want
 from deepshade_service.live.asking import Asking, Reader
 from deepshade_service.live.connection import Connection
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
 
 _HELLO = 10.0  # seconds for the first message
 _STATUS = 1.0
+_REFUSED = {
+    401: "The service's token is needed, or a link's",
+    403: "Others can reach the service, and it has no token",
+}
 
 
 def install(app: FastAPI, service: Service, sessions: Sessions, tokens: Tokens) -> None:
@@ -52,12 +57,22 @@ def install(app: FastAPI, service: Service, sessions: Sessions, tokens: Tokens) 
             tokens.check_viewer(socket, name)
             await _view(connection, sessions.find(name))
 
-    @app.get("/live", tags=["live"], summary="The live sessions, each with its last status")
+    @app.get(
+        "/live",
+        tags=["live"],
+        summary="The live sessions, each with its last status",
+        responses=errors(_REFUSED),
+    )
     async def listed(request: Request) -> list[dict[str, Any]]:
         tokens.check(request)
         return [{"session": each.name, **each.status(0)} for each in sessions.all()]
 
-    @app.post("/live/{name}/link", tags=["live"], summary="A link for viewers, for an hour")
+    @app.post(
+        "/live/{name}/link",
+        tags=["live"],
+        summary="A link for viewers, for an hour",
+        responses=errors(_REFUSED | {404: "No such session"}),
+    )
     async def link(request: Request, name: str) -> dict[str, Any]:
         tokens.check(request)
         sessions.find(name)
