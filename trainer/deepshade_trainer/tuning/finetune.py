@@ -280,7 +280,7 @@ def _pair(
         except DataError:
             return None
         errors.append([row.figures["dssim"] for row in rows])
-    return Paired.of(*errors)
+    return Paired.of(*errors, [row.figures["noise"] for row in rows if "noise" in row.figures])
 
 
 def speed(base: Bundle, bundle: Bundle) -> float:
