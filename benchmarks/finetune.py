@@ -35,9 +35,9 @@ LOWER, HIGHER = 0.12, 0.03
 # name -> views, seed, rays a pixel, whether of the scene
 SETS = {
     "own": (64, 101, 128, True),
-    "others": (24, 102, 256, True),
+    "others": (24, 102, 1024, True),  # with less the references' own noise hides what is gained
     "rehearsal": (96, 201, 128, False),
-    "test": (36, 202, 256, False),
+    "test": (36, 202, 1024, False),
 }
 
 

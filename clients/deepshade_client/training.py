@@ -36,7 +36,7 @@ def train(
     ] = None,
     views: Annotated[int, typer.Option(min=8, help="Views of the scene.")] = 64,
     size: Annotated[int, typer.Option(min=16, help="Their side, pixels.")] = 256,
-    spp: Annotated[int, typer.Option(min=2, help="Their reference rays a pixel.")] = 128,
+    spp: Annotated[int, typer.Option(min=2, help="Their reference rays a pixel.")] = 256,
     base: Annotated[str, typer.Option(help="Bundle to begin with.")] = "balanced",
     name: Annotated[
         str | None, typer.Option(help="What to publish it as. Default: as the base.")

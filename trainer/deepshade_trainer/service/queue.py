@@ -23,6 +23,7 @@ from deepshade_trainer.service.store import (
     CANCELLED,
     DONE,
     FAILED,
+    OVER,
     QUEUED,
     RUNNING,
     Job,
@@ -37,6 +38,7 @@ log = logging.getLogger("deepshade.trainer")
 T = TypeVar("T")
 
 PAUSE = 1.0  # seconds until a database that is away is asked again
+MOMENT = 0.05  # seconds
 GRACE = 30.0  # seconds in which a job finishes its step and saves
 
 
@@ -93,17 +95,19 @@ class Queue:
 
     async def cancel(self, job: Job) -> bool:
         """Stop a job, running or waiting; whether there was something to stop."""
-        said = {"sentence": "cancelled"}
-        if await asyncio.to_thread(
-            lambda: self._store.move(job.id, CANCELLED, of=(QUEUED,), **said)
-        ):
-            return True
-        process = self._running.get(job.id)
-        if process is None:
-            return False
-        self._cancelled.add(job.id)
-        self._keep(self._end(process))
-        return True
+        while True:
+            if await asyncio.to_thread(
+                lambda: self._store.move(job.id, CANCELLED, of=(QUEUED,), sentence="cancelled")
+            ):
+                return True
+            if (process := self._running.get(job.id)) is not None:
+                self._cancelled.add(job.id)
+                self._keep(self._end(process))
+                return True
+            current = await asyncio.to_thread(self._store.get, job.id)
+            if current is None or current.state in OVER:
+                return False
+            await asyncio.sleep(MOMENT)  # its process is just beginning, or its end being noted
 
     async def _end(self, process: asyncio.subprocess.Process) -> None:
         """Ask a process to stop, and then see to it."""

@@ -43,7 +43,7 @@ class TrainRequest(BaseModel):
     )
     views: int = Field(64, ge=8, le=100_000, description="Views of the scene to render.")
     size: int = Field(256, ge=16, le=2048, description="Their side in pixels.")
-    spp: int = Field(128, ge=2, le=65536, description="Their reference rays a pixel.")
+    spp: int = Field(256, ge=2, le=65536, description="Their reference rays a pixel.")
     minutes: Annotated[float, _between("minutes")] = Field(10.0, description="Of training.")
     steps: Annotated[int, _between("steps")] = Field(0, description="Instead of minutes.")
     seed: Annotated[int, _between("seed")] = 0

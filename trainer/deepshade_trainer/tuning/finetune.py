@@ -43,7 +43,7 @@ from deepshade_trainer.tuning.steps import Event, dataset_of, folders_of, own_pa
 from deepshade_trainer.tuning.verdict import FILE, Paired, Verdict
 from deepshade_trainer.validation import validated
 
-RATE = 4e-4  # of a preset's learning rate of 2e-3: what a base knows is kept, and yet it moves
+RATE = 8e-4  # of 2e-3, from which networks begin: what a base knows is kept, and yet it moves
 EMA = 0.95
 PILOT = 4  # steps, of which the first is not timed
 USED = 0.85  # of the minutes are steps; the rest is for validation and saving
@@ -245,7 +245,7 @@ def _pair(
         except DataError:
             return None
         errors.append([row.figures["dssim"] for row in rows])
-    return Paired.of(*errors)
+    return Paired.of(*errors, [row.figures["noise"] for row in rows if "noise" in row.figures])
 
 
 def speed(base: Bundle, bundle: Bundle) -> float:

@@ -18,7 +18,8 @@ class Paired:
 
     `low` and `high` bound that mean with `CONFIDENCE` by Student's t over the views' differences
     (Student, The probable error of a mean, 1908), which are near normal where views are alike.
-    Of a single view they are None.
+    Of a single view they are None. `noise` is the part of the error that the references' own noise
+    explains (`judging.floor`), where that is known: no candidate gets below it.
     """
 
     views: int
@@ -27,9 +28,12 @@ class Paired:
     difference: float
     low: float | None
     high: float | None
+    noise: float | None = None
 
     @classmethod
-    def of(cls, base: Sequence[float], candidate: Sequence[float]) -> Paired:
+    def of(
+        cls, base: Sequence[float], candidate: Sequence[float], noise: Sequence[float] = ()
+    ) -> Paired:
         """Of two equally long lists, at least one view each."""
         from scipy import stats
 
@@ -37,11 +41,12 @@ class Paired:
         difference = after - before
         mean = float(difference.mean())
         means = len(difference), float(before.mean()), float(after.mean()), mean
+        floor = float(np.mean(noise)) if len(noise) else None
         if len(difference) < 2:
-            return cls(*means, None, None)
+            return cls(*means, None, None, floor)
         error = float(difference.std(ddof=1)) / len(difference) ** 0.5
         reach = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(difference) - 1)) * error
-        return cls(*means, mean - reach, mean + reach)
+        return cls(*means, mean - reach, mean + reach, floor)
 
     @property
     def change(self) -> float:
@@ -55,7 +60,8 @@ class Paired:
             low, high = (100 * bound / self.base for bound in (self.low, self.high))
             sure = f", {CONFIDENCE:.0%} sure of {low:+.1f} to {high:+.1f} %"
         change = f"{100 * self.change:+.1f} %{sure}"
-        return f"DSSIM {self.candidate:.4f} after {self.base:.4f} ({change})"
+        floor = "" if self.noise is None else f", of which noise {self.noise:.4f}"
+        return f"DSSIM {self.candidate:.4f} after {self.base:.4f} ({change}{floor})"
 
 
 @dataclass(frozen=True)

@@ -31,12 +31,11 @@ def main(folder: Path) -> int:
     """Do the job of a folder, or go on with it; its events say how it goes."""
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # a worker of a service that was killed ends in a moment
-        log, step = EventLog(folder), -1
+        log = EventLog(folder)
         try:
             plan = Plan.read(folder)
             for event in _all(plan, folder):
                 log.add(event)
-                step = int(event.get("step", step))
         except DeepshadeError as error:
             log.add({"phase": "failed", "error": str(error), "fix": error.fix})
             return error.exit_code
