@@ -21,6 +21,7 @@ ENV PATH=/opt/deepshade/bin:/usr/local/bin:/usr/bin:/bin PYTHONUNBUFFERED=1 \
 WORKDIR /shards
 USER 10001:10001
 EXPOSE 6379 8265 10001
-HEALTHCHECK --interval=10s --timeout=8s --start-period=90s --retries=3 \
-    CMD ["sh", "-c", "ray health-check --address ${RAY_HEAD:-127.0.0.1:6379}"]
+# of this node; its agent, which takes jobs, answers it without a token
+HEALTHCHECK --interval=10s --timeout=8s --start-period=120s --retries=3 \
+    CMD ["python3", "-m", "deepshade.health", "http://127.0.0.1:52365/api/local_raylet_healthz"]
 CMD ["ray", "start", "--head", "--port=6379", "--dashboard-host=0.0.0.0", "--num-cpus=0", "--block"]

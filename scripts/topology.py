@@ -133,11 +133,14 @@ class Topology:
         self.running[name] = Running(process, children[0])
 
     def wait(self, name: str, patience: float = 180.0) -> None:
-        """Until its health check passes. Raises RuntimeError where it ends or never does."""
+        """Until its health check passes; one that ends begins again, as `restart` says.
+
+        Raises RuntimeError where that helps in no time.
+        """
         deadline = time.monotonic() + patience
         while True:
             if self.running[name].process.poll() is not None:
-                raise RuntimeError(f"{name} ended: {self.log(name)[-2000:]}")
+                self.start(name)
             found = self.execute(name, *self._health(name), check=False)
             if found.returncode == 0:
                 return
