@@ -106,7 +106,7 @@ class Topology:
         for space in reversed(self._made):
             subprocess.run(["ip", "netns", "delete", space], check=False)
 
-    def up(self, *names: str, patience: float = 180.0) -> None:
+    def up(self, *names: str, patience: float = 600.0) -> None:
         """Start services, in that order, each when those before it are healthy."""
         for name in names:
             self.start(name)
@@ -132,7 +132,7 @@ class Topology:
             time.sleep(0.01)
         self.running[name] = Running(process, children[0])
 
-    def wait(self, name: str, patience: float = 180.0) -> None:
+    def wait(self, name: str, patience: float = 600.0) -> None:
         """Until its health check passes; one that ends begins again, as `restart` says.
 
         Raises RuntimeError where that helps in no time.
@@ -153,7 +153,7 @@ class Topology:
     ) -> subprocess.CompletedProcess[str]:
         """As `docker compose exec`: a command in a running service, with its environment."""
         image = self._image(name)
-        enter = ["nsenter", "-t", str(self.running[name].first), "-m", "-n", "-p", "-i", "-u", "-r"]
+        enter = ["nsenter", "-t", str(self.running[name].first), "-m", "-n", "-p", "-i", "-u", "-r", "-w"]
         done = subprocess.run(
             [*enter, *self._inside(self._service(name), image, command)],
             capture_output=True,

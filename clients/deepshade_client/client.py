@@ -12,6 +12,7 @@ from typing import Any, Self, TypeVar
 import httpx
 
 from deepshade.files import replacing
+from deepshade.tracing import carried, span
 from deepshade_client.answer import Answer, Saved
 from deepshade_client.exceptions import ClientError
 from deepshade_client.request import (
@@ -32,6 +33,14 @@ from deepshade_client.settings import Retry, Timeout, default_server
 
 T = TypeVar("T")
 Waiting = Callable[[ClientError, float], None]
+
+
+def _carry(request: httpx.Request) -> None:
+    request.headers.update(carried())
+
+
+async def _carry_too(request: httpx.Request) -> None:
+    _carry(request)
 
 
 class Client:
@@ -58,6 +67,7 @@ class Client:
             base_url=base_url(self.server),
             timeout=(timeout or Timeout()).as_httpx(),
             transport=transport,
+            event_hooks={"request": [_carry]},
         )
 
     def shade(self, effect: Effects, picture: Picture, options: Options | None = None) -> Answer:
@@ -127,7 +137,8 @@ class Client:
             with _released(self._http.request(**request)) as response:
                 return read(response)
 
-        return self._try(ask)
+        with span("ask", kind="CLIENT"):
+            return self._try(ask)
 
     def _save(self, path: Path, request: dict[str, Any]) -> Saved:
         response = self._http.send(self._http.build_request(**request), stream=True)
@@ -177,6 +188,7 @@ class AsyncClient:
             base_url=base_url(self.server),
             timeout=(timeout or Timeout()).as_httpx(),
             transport=transport,
+            event_hooks={"request": [_carry_too]},
         )
 
     async def shade(
@@ -236,7 +248,8 @@ class AsyncClient:
             with _released(await self._http.request(**request)) as response:
                 return read(response)
 
-        return await self._try(ask)
+        with span("ask", kind="CLIENT"):
+            return await self._try(ask)
 
     async def _save(self, path: Path, request: dict[str, Any]) -> Saved:
         response = await self._http.send(self._http.build_request(**request), stream=True)

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from deepshade.errors import ConfigError
+from deepshade.tracing import ids
 
 VARIABLE = "DEEPSHADE_LOG_FORMAT"
 FORMATS = ("text", "json")
@@ -33,9 +34,7 @@ class JsonFormatter(logging.Formatter):
         arguments = record.args
         if record.name == "uvicorn.access" and isinstance(arguments, tuple):
             entry |= dict(zip(_ACCESS, arguments, strict=False))
-        for name in ("trace_id", "span_id"):
-            if value := getattr(record, name, None):
-                entry[name] = value
+        entry |= ids()
         if record.exc_info:
             entry["exception"] = self.formatException(record.exc_info)
         return json.dumps(entry, default=str)

@@ -23,6 +23,7 @@ from deepshade.errors import EngineError
 from deepshade.machine import trim
 from deepshade.problems import MEDIA_TYPE as PROBLEM_TYPE
 from deepshade.tokens import TokenGuard
+from deepshade.tracing import Tracing
 from deepshade_service import bundle_routes, composition, problems
 from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
@@ -127,6 +128,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
     app.add_middleware(TokenGuard, token=service.settings.token, guarded=bundle_routes.guarded)
+    app.add_middleware(Tracing)
 
     @app.post(
         "/shade/{effect}",

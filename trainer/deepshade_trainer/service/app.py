@@ -15,6 +15,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi_offline import FastAPIOffline
 
 from deepshade.tokens import TokenGuard
+from deepshade.tracing import Tracing
 from deepshade_trainer.run import Run
 from deepshade_trainer.service import problems
 from deepshade_trainer.service.config import Settings
@@ -107,6 +108,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.trainer = trainer
     problems.install(app)
     app.add_middleware(TokenGuard, token=settings.token, guarded=lambda _, path: path not in OPEN)
+    app.add_middleware(Tracing)
 
     @app.post(
         "/train/{effect}",
