@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from deepshade import tracing
 from deepshade.cli import CONTEXT, Version, run
 from deepshade_client import training
 from deepshade_client.exceptions import NotReady, TransportError
@@ -37,6 +38,7 @@ def root(show_version: Version = False) -> None:
 
     Example: deepshade-client shade ao renders/*.exr -o shaded/ --radius 0.5
     """
+    tracing.begin("deepshade-client")
 
 
 @app.command(epilog=EXIT_CODES)
@@ -479,7 +481,10 @@ for command in (training.train, training.jobs, training.bundles, training.pin, t
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs the command; returns its exit code, and says on stderr what went wrong."""
-    return run(typer.main.get_command(app), arguments, name="deepshade-client")
+    try:
+        return run(typer.main.get_command(app), arguments, name="deepshade-client")
+    finally:
+        tracing.end()
 
 
 def _effects(server: str) -> list[dict[str, Any]]:

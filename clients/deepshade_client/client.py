@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import httpx
 
 from deepshade.files import replacing
+from deepshade.tracing import carried, span
 from deepshade_client.answer import Answer, Saved
 from deepshade_client.exceptions import ClientError
 from deepshade_client.request import (
@@ -36,6 +37,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 Waiting = Callable[[ClientError, float], None]
+
+
+def _carry(request: httpx.Request) -> None:
+    request.headers.update(carried())
+
+
+async def _carry_too(request: httpx.Request) -> None:
+    _carry(request)
 
 
 class Client:
@@ -63,6 +72,7 @@ class Client:
             base_url=base_url(self.server),
             timeout=Timeout.of(timeout).as_httpx(),
             transport=transport,
+            event_hooks={"request": [_carry]},
         )
 
     def shade(self, effect: Effects, picture: Picture, options: Options | None = None) -> Answer:
@@ -149,7 +159,8 @@ class Client:
             with _released(self._http.request(**request)) as response:
                 return read(response)
 
-        return self._try(ask)
+        with span("ask", kind="CLIENT"):
+            return self._try(ask)
 
     def _save(self, path: Path, request: dict[str, Any]) -> Saved:
         response = self._http.send(self._http.build_request(**request), stream=True)
@@ -199,6 +210,7 @@ class AsyncClient:
             base_url=base_url(self.server),
             timeout=Timeout.of(timeout).as_httpx(),
             transport=transport,
+            event_hooks={"request": [_carry_too]},
         )
 
     async def shade(
@@ -270,7 +282,8 @@ class AsyncClient:
             with _released(await self._http.request(**request)) as response:
                 return read(response)
 
-        return await self._try(ask)
+        with span("ask", kind="CLIENT"):
+            return await self._try(ask)
 
     async def _save(self, path: Path, request: dict[str, Any]) -> Saved:
         response = await self._http.send(self._http.build_request(**request), stream=True)

@@ -17,6 +17,7 @@ import httpx
 from deepshade.files import replacing
 from deepshade.manifest import NAME, Manifest, shard_path
 from deepshade.tokens import VARIABLE
+from deepshade.tracing import carried
 from deepshade_client.exceptions import BadAnswer, ClientError, TransportError
 from deepshade_client.request import base_url, check, read_list, read_object, transport_error
 from deepshade_client.settings import Retry, Timeout
@@ -180,7 +181,8 @@ class Trainer:
                 try:
                     if path is not None:
                         options["content"] = _pieces(path)
-                    return read(self._http.request(method, url, **options))
+                    headers = carried()
+                    return read(self._http.request(method, url, headers=headers, **options))
                 except httpx.HTTPError as error:
                     raise transport_error(error, self.server) from error
             except ClientError as error:

@@ -18,6 +18,8 @@ from deepshade.errors import BundleError, ConfigError, nearest
 from deepshade.files import replacing, sha256, shipped
 from deepshade.tensors import channel_count
 
+# in a graph: an entry of TensorProto.external_data whose key is "location" (onnx.proto)
+_EXTERNAL = b"\x0a\x08location\x12"
 SHIPPED = "shipped"  # as a folder of models: those that come with the program
 MODEL = "model.onnx"
 CONFIG = "config.json"
@@ -129,6 +131,11 @@ class Bundle:
                 f"{path / MODEL} is not the file that {CONFIG} describes "
                 f"(sha256 {found[:12]}…, expected {bundle.short_hash}…)",
                 fix="get the bundle again, or export it again",
+            )
+        if _EXTERNAL in (path / MODEL).read_bytes():
+            raise BundleError(
+                f"{path / MODEL} has tensors in other files, which nothing would verify",
+                fix="export it with all tensors inside",
             )
         return bundle
 

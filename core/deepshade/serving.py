@@ -7,6 +7,7 @@ import socket
 from typing import Any
 
 from deepshade.errors import DeepshadeError
+from deepshade.logs import JsonFormatter, as_json
 
 _POLLS = ("/healthz", "/readyz", "/metrics")
 
@@ -43,7 +44,7 @@ def _no_poll(record: logging.LogRecord) -> bool:
 
 
 def logging_config(level: str) -> dict[str, Any]:
-    """uvicorn's own set-up, and ours beside it."""
+    """uvicorn's own set-up, and ours beside it; lines of JSON if $DEEPSHADE_LOG_FORMAT says so."""
     from copy import deepcopy
 
     from uvicorn.config import LOGGING_CONFIG
@@ -51,6 +52,8 @@ def logging_config(level: str) -> dict[str, Any]:
     config = deepcopy(LOGGING_CONFIG)
     for formatter in config["formatters"].values():
         formatter["fmt"] = f"%(asctime)s {formatter['fmt']}"
+    if as_json():
+        config["formatters"] = {name: {"()": JsonFormatter} for name in config["formatters"]}
     config["filters"] = {"polls": {"()": lambda: _no_poll}}
     config["handlers"]["access"]["filters"] = ["polls"]
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "deepshade"):

@@ -22,6 +22,7 @@ from deepshade.errors import EngineError
 from deepshade.files import shipped
 from deepshade.machine import trim
 from deepshade.tokens import TokenGuard
+from deepshade.tracing import Tracing
 from deepshade_service import bundle_routes, composition, pages, problems, upload_routes
 from deepshade_service import environment_routes as routes
 from deepshade_service.answers import Shaded
@@ -150,6 +151,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(Counting, telemetry=service.telemetry)
     app.add_middleware(Closing)
     app.add_middleware(TokenGuard, token=service.settings.token, guarded=bundle_routes.guarded)
+    app.add_middleware(Tracing)
 
     @app.post(
         "/shade/{effect}",

@@ -12,6 +12,7 @@ from types import FrameType
 
 import uvicorn
 
+from deepshade import tracing
 from deepshade_service.app import Service
 
 
@@ -43,6 +44,7 @@ class Server(uvicorn.Server):
 
 
 def _end(status: int) -> None:
+    tracing.end()
     logging.shutdown()
     sys.stdout.flush()
     os._exit(status)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
 from deepshade.machine import resident
+from deepshade.tracing import span
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 30, 60)
@@ -25,7 +26,8 @@ class Stopwatch:
         """Add the block's duration to `stage`."""
         start = time.perf_counter()
         try:
-            yield
+            with span(stage):
+                yield
         finally:
             took = 1e3 * (time.perf_counter() - start)
             self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + took

@@ -9,6 +9,7 @@ import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from contextvars import copy_context
 from typing import Any, TypeVar
 
 from deepshade_service.problems import Problem
@@ -94,7 +95,9 @@ class Workers:
             cancelled = threading.Event()
             self._running.add(cancelled)
             start = time.monotonic()
-            future = asyncio.get_running_loop().run_in_executor(self._pool, work, cancelled)
+            future = asyncio.get_running_loop().run_in_executor(
+                self._pool, copy_context().run, work, cancelled
+            )
             try:
                 return await asyncio.shield(future)
             except asyncio.CancelledError:

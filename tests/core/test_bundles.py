@@ -5,6 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from deepshade.bundles import Bundle, bundle_folders, bundle_roots, overlooked, write_config
@@ -127,6 +128,21 @@ def test_refuses_changed_and_missing_files(folder):
         Bundle.load(folder)
     (folder / "model.onnx").unlink()
     with pytest.raises(BundleError, match="missing"):
+        Bundle.load(folder)
+
+
+def test_refuses_a_graph_that_reads_other_files(folder):
+    """A stranger's graph could have the service read what isn't the stranger's."""
+    onnx = pytest.importorskip("onnx")
+    weight = onnx.numpy_helper.from_array(np.ones(4, np.float32), "w")
+    graph = onnx.helper.make_graph([], "g", [], [], [weight])
+    model = onnx.helper.make_model(graph)
+    onnx.save(model, folder / "model.onnx")
+    make(folder)
+    Bundle.load(folder)
+    onnx.save(model, folder / "model.onnx", save_as_external_data=True, size_threshold=0)
+    make(folder)
+    with pytest.raises(BundleError, match="tensors in other files"):
         Bundle.load(folder)
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, Header, Query, Request, Response
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, PlainTextResponse
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from fastapi_offline import FastAPIOffline
 
 from deepshade.tokens import TokenGuard
+from deepshade.tracing import Tracing
 from deepshade_trainer.run import Run
 from deepshade_trainer.service import problems
 from deepshade_trainer.service.config import Settings
@@ -23,6 +24,8 @@ from deepshade_trainer.service.publishing import Publisher, describe
 from deepshade_trainer.service.queue import Queue
 from deepshade_trainer.service.request import TrainRequest, job_of
 from deepshade_trainer.service.store import AGAIN, OVER, QUEUED, Job, Store
+from deepshade_trainer.service.telemetry import MEDIA_TYPE as METRICS_TYPE
+from deepshade_trainer.service.telemetry import Telemetry
 from deepshade_trainer.service.uploads import Uploads
 from deepshade_trainer.tuning.events import last_event, read_events
 
@@ -40,6 +43,7 @@ class Trainer:
         self.publisher = Publisher(settings)
         self.queue = Queue(settings, self.store, self.publisher)
         self.uploads = Uploads(settings.folder / "uploads", settings.upload_bytes)
+        self.telemetry = Telemetry(self.store, lambda job: last_event(self.queue.folder(job)))
         self.stopping = asyncio.Event()
 
     @asynccontextmanager
@@ -104,6 +108,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.trainer = trainer
     problems.install(app)
     app.add_middleware(TokenGuard, token=settings.token, guarded=lambda _, path: path not in OPEN)
+    app.add_middleware(Tracing)
 
     @app.post(
         "/train/{effect}",
@@ -188,6 +193,15 @@ def create_app(settings: Settings) -> FastAPI:
     @app.get("/readyz", tags=["operation"], summary="Does its database answer?")
     def readyz() -> dict[str, Any]:
         return {"status": "ready", "waiting": trainer.store.waiting()}
+
+    @app.get(
+        "/metrics",
+        tags=["operation"],
+        summary="Jobs and what they do, for Prometheus",
+        response_class=PlainTextResponse,
+    )
+    def metrics() -> Response:
+        return PlainTextResponse(trainer.telemetry.render(), media_type=METRICS_TYPE)
 
     return app
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from deepshade import tracing
 from deepshade.cli import CONTEXT, Version, run
 from deepshade.serving import listen, logging_config
 
@@ -123,6 +124,7 @@ def serve(
 
         where, number = listener.getsockname()[:2]
         shown = f"[{where}]" if ":" in where else where
+        tracing.begin("deepshade-trainer")
         application = create_app(settings)
         print(f"deepshade trains at http://{shown}:{number} (Ctrl-C stops it)", flush=True)
         config = uvicorn.Config(
@@ -135,6 +137,7 @@ def serve(
         for each in (signal.SIGINT, signal.SIGTERM):
             signal.signal(each, lambda *_: None)
         uvicorn.Server(config).run(sockets=[listener])
+        tracing.end()
 
 
 def main(arguments: list[str] | None = None) -> int:

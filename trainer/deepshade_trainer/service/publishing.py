@@ -13,6 +13,7 @@ from typing import Any
 
 from deepshade.bundles import CONFIG, MODEL
 from deepshade.errors import BundleError
+from deepshade.tracing import carried
 from deepshade.versions import Alias, Version, aliases
 from deepshade_trainer.service.config import Settings
 
@@ -114,7 +115,7 @@ class Publisher:
 def tell(service: str, token: str | None, label: str) -> None:
     """Have a shading service look again. Raises Refused where it can't use the bundle `label`, and
     OSError where it isn't there or doesn't listen to us."""
-    request = urllib.request.Request(f"{service.rstrip('/')}/bundles/reload", method="POST")
+    request = urllib.request.Request(f"{service.rstrip('/')}/bundles/reload", headers=carried(), method="POST")
     if token:
         request.add_header("Authorization", f"Bearer {token}")
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from sqlalchemy.exc import SQLAlchemyError
 
 from deepshade.errors import ConfigError, DeepshadeError
+from deepshade.tracing import span
 from deepshade_trainer.service.config import Settings
 from deepshade_trainer.service.publishing import Publisher
 from deepshade_trainer.service.store import (
@@ -137,6 +138,10 @@ class Queue:
         self._keep(self._watch(job, process))
 
     async def _watch(self, job: Job, process: asyncio.subprocess.Process) -> None:
+        with span("job", job=job.id, effect=job.effect, bundle=job.name):
+            await self._see(job, process)
+
+    async def _see(self, job: Job, process: asyncio.subprocess.Process) -> None:
         code = await process.wait()
         state, values = DONE, dict[str, Any]()
         if job.id in self._cancelled:
@@ -166,7 +171,8 @@ class Queue:
             if not decision["better"]:
                 return DONE, {"sentence": sentence}
             bundle = candidate(folder, Plan.read(folder))
-            version, said = self._publisher.publish(bundle, job.effect, job.name)
+            with span("publish"):
+                version, said = self._publisher.publish(bundle, job.effect, job.name)
             label = f"published as {job.effect}/{job.name} {version.number}"
             more = f" ({said})" if said else ""
             return DONE, {"sentence": f"{label}: {sentence}{more}", "published": version.number}

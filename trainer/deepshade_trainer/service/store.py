@@ -17,6 +17,7 @@ QUEUED, RUNNING, DONE = "queued", "running", "done"
 FAILED, CANCELLED = "failed", "cancelled"
 AGAIN = (FAILED, CANCELLED)  # what asking again begins anew
 OVER = (DONE, FAILED, CANCELLED)
+STATES = (QUEUED, RUNNING, *OVER)
 
 
 class Table(DeclarativeBase):
@@ -112,6 +113,27 @@ class Store:
         """How many wait in all."""
         with self._session() as session:
             return session.scalars(select(func.count()).where(Job.state == QUEUED)).one()
+
+    def counts(self) -> dict[str, int]:
+        """How many there are by state."""
+        with self._session() as session:
+            query = select(Job.state, func.count()).group_by(Job.state)
+            return {state: count for state, count in session.execute(query)}
+
+    def published(self) -> int:
+        """How many were published."""
+        with self._session() as session:
+            return session.scalars(select(func.count()).where(Job.published.is_not(None))).one()
+
+    def in_state(self, state: str) -> list[Job]:
+        """Those in a state, the first first."""
+        with self._session() as session:
+            return list(session.scalars(select(Job).where(Job.state == state).order_by(Job.place)))
+
+    def oldest(self) -> float | None:
+        """Since when the first that waits does; None where none waits."""
+        with self._session() as session:
+            return session.scalars(select(func.min(Job.place)).where(Job.state == QUEUED)).one()
 
     def claim(self) -> Job | None:
         """The first that waits, which now runs; None where none waits."""

@@ -1,0 +1,150 @@
+"""The whole loop on docker-compose.yml's services, without a container engine.
+
+    sudo python scripts/loop.py --small        # minutes; without --small a quarter of an hour
+
+Services up with new tokens; `ray job submit -- deepshade datagen` renders views of one scene; the
+trainer fine-tunes ambient occlusion to them and publishes it; the shading service answers with
+the new version, and after a rollback with the old; all down. Says what it does and how long it
+took, and ends with 1 where anything is otherwise. `--images` takes roots of scripts/images.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "scripts"))
+
+from topology import Topology, permitted, read  # noqa: E402
+
+SERVICES = ("service", "ray-head", "ray-worker", "trainer")
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is rendered and trained."""
+
+    views: int
+    pixels: int
+    rays: int
+    training: tuple[str, ...]
+
+
+SMALL = Size(24, 128, 16, ("--steps", "40", "--lr", "0.002", "--worse", "1", "--slower", "100"))
+WHOLE = Size(64, 256, 128, ("--minutes", "8"))
+SCENE = "procedural:fences:3"
+
+
+@contextmanager
+def step(text: str) -> Iterator[None]:
+    """Say what is done and how long it took."""
+    print(f"{text} ...", end=" ", flush=True)
+    begun = time.monotonic()
+    yield
+    print(f"{time.monotonic() - begun:.1f} s", flush=True)
+
+
+def prepare(out: Path) -> dict[str, Any]:
+    """An empty folder with a new .env, and the services that it describes."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    made = [sys.executable, str(ROOT / "deploy/env.py"), "--out", str(out / ".env")]
+    subprocess.run(made, check=True, stdout=subprocess.DEVNULL)
+    return read(ROOT / "docker-compose.yml", out / ".env")
+
+
+def shaded(topology: Topology) -> tuple[str, bytes]:
+    """The hash of the bundle that answers, and the picture."""
+    answer = httpx.post(
+        f"http://{topology.published}:8000/shade/ao",
+        content=(ROOT / "samples/room.exr").read_bytes(),
+        headers={"Content-Type": "image/x-exr"},
+        timeout=120,
+        trust_env=False,
+    )
+    answer.raise_for_status()
+    return answer.headers["Deepshade-Bundle-Sha256"], answer.content
+
+
+def render(topology: Topology, size: Size) -> None:
+    """Have Ray render a data set into the volume `shards`."""
+    topology.execute(
+        "ray-head",
+        *("ray", "job", "submit", "--address", "http://127.0.0.1:8265", "--"),
+        *("deepshade", "datagen", "--out", "/shards/mine", "--scenes", SCENE),
+        *("--views", str(size.views), "--size", str(size.pixels), "--spp", str(size.rays)),
+    )
+
+
+def client(topology: Topology, *words: str, check: bool = True) -> Any:
+    """What `deepshade-client --json` says in the trainer's container."""
+    done = topology.execute("trainer", "deepshade-client", *words, "--json", check=False)
+    if check and done.returncode:
+        raise RuntimeError(f"deepshade-client {' '.join(words)}: {done.stdout}{done.stderr}")
+    return json.loads(done.stdout) if done.stdout.strip() else None
+
+
+def tune(topology: Topology, size: Size) -> Any:
+    """Have it fine-tuned and published; the job. Raises RuntimeError where it isn't."""
+    return client(topology, "train", "ao", "--data", "mine", *size.training)
+
+
+def loop(topology: Topology, size: Size) -> None:
+    """Once around. Raises RuntimeError where something isn't as it should be."""
+    with step(f"up: {', '.join(SERVICES)}"):
+        topology.up(*SERVICES)
+    first, _ = shaded(topology)
+    with step(f"ray job submit: {size.views} views of {SCENE}"):
+        render(topology, size)
+    with step("train"):
+        job = tune(topology, size)
+    print(f"  {job['sentence']}")
+    second, _ = shaded(topology)
+    if second == first:
+        raise RuntimeError("the service answers with the old version")
+    with step("rollback"):
+        client(topology, "rollback", "ao/balanced")
+    if shaded(topology)[0] != first:
+        raise RuntimeError("after the rollback the service doesn't answer with the old version")
+    with step("down"):
+        ended = {name: topology.stop(name) for name in reversed(SERVICES)}
+    print(f"  exit codes {ended}")
+    if ended["service"] or ended["trainer"]:
+        raise RuntimeError("service and trainer end with 0 when they are asked to")
+
+
+def main() -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--small", action="store_true")
+    parser.add_argument("--out", type=Path, default=ROOT / "out/loop", help="is emptied first")
+    parser.add_argument("--images", type=Path)
+    asked = parser.parse_args()
+    if not permitted():
+        print("this needs root, and leave to make namespaces and mounts", file=sys.stderr)
+        return 2
+    try:
+        with Topology(prepare(asked.out), asked.out, asked.images) as topology:
+            loop(topology, SMALL if asked.small else WHOLE)
+    except (RuntimeError, httpx.HTTPError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
