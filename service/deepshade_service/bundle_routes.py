@@ -120,7 +120,7 @@ def described(models: Models, effect: str, name: str) -> dict[str, Any]:
 
 def describe(bundle: Bundle) -> dict[str, Any]:
     """A bundle and its versions as JSON values."""
-    found = {
+    found: dict[str, Any] = {
         "effect": bundle.effect,
         "name": bundle.name,
         "sha256": bundle.sha256,

@@ -103,7 +103,7 @@ def install(app: FastAPI, service: Service) -> None:
         tags=["uploads"],
         summary="One layer's pixels",
         response_class=Response,
-        responses={200: {"content": {"image/x-exr": {"schema": _BINARY}}}} | errors(_KEPT),
+        responses=errors(_KEPT) | {200: {"content": {"image/x-exr": {"schema": _BINARY}}}},
     )
     async def layer(name: str, index: int) -> Response:
         """An uncompressed EXR of `Y`, or of `R G B A` as far as the layer has channels, in the

@@ -245,7 +245,8 @@ def _pair(
         except DataError:
             return None
         errors.append([row.figures["dssim"] for row in rows])
-    return Paired.of(*errors, [row.figures["noise"] for row in rows if "noise" in row.figures])
+    noise = [row.figures["noise"] for row in rows if "noise" in row.figures]
+    return Paired.of(errors[0], errors[1], noise)
 
 
 def speed(base: Bundle, bundle: Bundle) -> float:
