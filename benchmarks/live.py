@@ -59,7 +59,7 @@ def main() -> None:
     planes["Z"] = -image.pixels["position.Z"].astype("<f4")  # what an engine has
     picture = Picture(planes, {"deepshade:fov": 50.0})
     bundle = Bundle.load(options.models / "ao" / options.bundle)
-    with Server(options.models, ("--threads", str(options.threads))) as server:
+    with Server([options.models], ("--threads", str(options.threads))) as server:
         path = f"/shade/ao?bundle={options.bundle}"
         backend = server.shade(path, body).backend
         engine = load_engine(bundle, Backend(*backend.split("/", 1)), threads=options.threads)
@@ -107,7 +107,7 @@ async def _measure(server: Server, picture: Picture, options: Any, bare: Any) ->
     }
     async with _proxy(server._http.port) as port:
         slow = await run(options.seconds, f"http://127.0.0.1:{port}", "slow")
-    link = {k: round(slow[k], 3) for k in ("fps", "p95", "oldest")} | {"codec": slow["bytes"]}
+    link = {k: round(slow[k], 3) for k in ("fps", "p95", "oldest")} | {"bytes": slow["bytes"]}
     costs, rates = {}, {}
     for count in (0, 1, 10):
         async with _viewers(url, "seen", count):

@@ -42,7 +42,7 @@ def main() -> None:
     body = options.input.read_bytes() if options.input else analytic_picture(512, 768)
     bundle = Bundle.load(options.models / options.effect / options.bundle)
     path = f"/shade/{options.effect}?bundle={options.bundle}"
-    with Server(options.models, ("--threads", str(options.threads))) as server:
+    with Server([options.models], ("--threads", str(options.threads))) as server:
         backend = server.shade(path, body).backend
         engine = load_engine(bundle, Backend(*backend.split("/", 1)), threads=options.threads)
         ready = network_input(bundle, body)
