@@ -98,9 +98,10 @@ def answered(page):
 def shows(page, wanted):
     """Whether the picture is seen as these (H, W, 3) 8-bit values, a pixel a pixel, but for what
     rounding does; in the middle of the canvas, whose sides may be odd."""
-    page.locator("#canvas").press("1")
     height, width = wanted.shape[:2]
     for _ in range(20):  # a browser that is starved takes some time to draw
+        page.locator("#canvas").press("0")
+        page.locator("#canvas").press("1")
         shown = Image.open(io.BytesIO(page.locator("#canvas").screenshot())).convert("RGB")
         left, top = (shown.width - width) // 2, (shown.height - height) // 2
         for y, x in itertools.product((top, top + 1), (left, left + 1)):

@@ -145,9 +145,12 @@ export class Viewer extends EventTarget {
     const width = Math.max(1, Math.round(canvas.clientWidth * ratio));
     const height = Math.max(1, Math.round(canvas.clientHeight * ratio));
     if (canvas.width === width && canvas.height === height) return;
+    const before = [canvas.width, canvas.height];
     [canvas.width, canvas.height] = [width, height];
-    if (this.fitted) this.fit();
-    else this.moved();
+    if (this.fitted) return this.fit();
+    // what was in the middle stays there
+    this.origin = this.origin.map((o, i) => o + ([width, height][i] - before[i]) / 2);
+    this.moved();
   }
 
   draw() {
