@@ -5,13 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from sqlalchemy import JSON, Engine, String, Text, create_engine, event, func, select, update
 from sqlalchemy.exc import ArgumentError, IntegrityError, NoSuchModuleError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
 from deepshade.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sqlalchemy import CursorResult, Update
 
 QUEUED, RUNNING, DONE = "queued", "running", "done"
 FAILED, CANCELLED = "failed", "cancelled"
@@ -88,9 +91,8 @@ class Store:
             now = time.time()
             anew = {"state": QUEUED, "place": now, "sentence": "", "fix": "", "ended": None}
             with self._session() as session:
-                changed = session.execute(
-                    update(Job).where(Job.key == job.key, Job.state.in_(AGAIN)).values(anew)
-                ).rowcount
+                query = update(Job).where(Job.key == job.key, Job.state.in_(AGAIN))
+                changed = _changed(session, query.values(anew))
                 return session.scalars(select(Job).where(Job.key == job.key)).one(), bool(changed)
 
     def get(self, number: str) -> Job | None:
@@ -143,9 +145,8 @@ class Store:
             if number is None:
                 return None
             values = {"state": RUNNING, "started": time.time(), "begun": Job.begun + 1}
-            claimed = session.execute(
-                update(Job).where(Job.id == number, Job.state == QUEUED).values(values)
-            ).rowcount
+            query = update(Job).where(Job.id == number, Job.state == QUEUED)
+            claimed = _changed(session, query.values(values))
             return session.get(Job, number) if claimed else None
 
     def move(self, number: str, to: str, *, of: tuple[str, ...], **values: Any) -> bool:
@@ -154,7 +155,7 @@ class Store:
             values.setdefault("ended", time.time())
         with self._session() as session:
             query = update(Job).where(Job.id == number, Job.state.in_(of))
-            return bool(session.execute(query.values(state=to, **values)).rowcount)
+            return bool(_changed(session, query.values(state=to, **values)))
 
     def close(self) -> None:
         """Close the connections."""
@@ -164,6 +165,11 @@ class Store:
     def _session(self) -> Iterator[Session]:
         with Session(self._engine, expire_on_commit=False) as session, session.begin():
             yield session
+
+
+def _changed(session: Session, query: Update) -> int:
+    """How many rows a query changed."""
+    return cast("CursorResult[Any]", session.execute(query)).rowcount
 
 
 def _durable(connection: Any, _: object) -> None:
