@@ -1,12 +1,14 @@
 """Every export of every bundle on one picture: how far each answer lies from the bundle's own.
 
 `python -m deepshade_report.exports GBUFFER --out DIR` measures, one bundle after another, what DIR
-doesn't know yet; with all of them known it writes the table of docs/shaders.md and a sheet.
+doesn't know yet; with all of them known it prints the table of docs/shaders.md and writes
+`sheet.png`.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 from deepshade import pictures, tensors
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.camera import camera_to_world
+from deepshade.cli import run
 from deepshade.effects import EFFECTS
 from deepshade.environments import Prepared, sky
 from deepshade.errors import ConfigError, EngineError
@@ -30,7 +33,6 @@ from deepshade_trainer.shaders import write_shaders
 from deepshade_trainer.shaders.lowering import lower
 
 Float = NDArray[np.float32]
-PAGE = Path("docs/shaders.md")
 _RUNNERS: dict[str, tuple[str, Callable[[Path], programs.Runner]]] = {
     "GLSL compute": ("glsl", programs.GlCompute),
     "GLSL fragment": ("glsl", programs.GlFragment),
@@ -105,13 +107,16 @@ def table(results: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The largest differences, a row a bundle."""
     lines = [f"| bundle | {' | '.join(COLUMNS)} |", "|---" * (len(COLUMNS) + 1) + "|"]
     for name, found in results.items():
-        cells = [f"{found[each]['largest']:.0e}" if each in found else "" for each in COLUMNS]
+        largest = [found[each]["largest"] if each in found else None for each in COLUMNS]
+        cells = ["" if each is None else f"{each:.0e}" if each else "0" for each in largest]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return lines
 
 
 def sheet(names: Sequence[str], out: Path) -> pictures.Picture:
     """A row a bundle: its own answer, then each export's, all exposed as the first needs it."""
+    stems = [name.replace("/", "-") for name in names]
+    width = min(np.load(out / f"{stem}-bundle.npy").shape[3] for stem in stems)  # as padded
     rows = []
     for name in names:
         effect, stem = EFFECTS[name.partition("/")[0]], name.replace("/", "-")
@@ -121,7 +126,8 @@ def sheet(names: Sequence[str], out: Path) -> pictures.Picture:
         for column in COLUMNS:
             path = out / f"{stem}-{column.replace(' ', '_')}.npy"
             row.append(np.load(path)[0] if path.exists() else np.full_like(own, high))
-        rows.append(np.concatenate([pictures.of_effect(each / high, effect) for each in row], 1))
+        shown = [pictures.of_effect(each[:, :, :width] / high, effect) for each in row]
+        rows.append(np.concatenate(shown, 1))
     return np.concatenate(rows)
 
 
@@ -154,4 +160,6 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    app = typer.Typer()
+    app.command()(main)
+    sys.exit(run(typer.main.get_command(app), name="python -m deepshade_report.exports"))
