@@ -281,6 +281,7 @@ class Topology:
         if service.get("read_only"):
             lines.append("mount -o remount,bind,ro root")
         command = service.get("command", image.command)
+        command = shlex.split(command) if isinstance(command, str) else command
         lines.append(f"hostname {name}")
         inside = self._inside(service, image, command)
         lines.append(f"exec chroot {quoted(str(at))} {shlex.join(inside)}")
