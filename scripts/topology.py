@@ -99,7 +99,10 @@ class Topology:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
     ) -> None:
         for name in reversed(list(self.running)):
             self.stop(name)
@@ -153,7 +156,18 @@ class Topology:
     ) -> subprocess.CompletedProcess[str]:
         """As `docker compose exec`: a command in a running service, with its environment."""
         image = self._image(name)
-        enter = ["nsenter", "-t", str(self.running[name].first), "-m", "-n", "-p", "-i", "-u", "-r", "-w"]
+        enter = [
+            "nsenter",
+            "-t",
+            str(self.running[name].first),
+            "-m",
+            "-n",
+            "-p",
+            "-i",
+            "-u",
+            "-r",
+            "-w",
+        ]
         done = subprocess.run(
             [*enter, *self._inside(self._service(name), image, command)],
             capture_output=True,
@@ -267,6 +281,7 @@ class Topology:
         if service.get("read_only"):
             lines.append("mount -o remount,bind,ro root")
         command = service.get("command", image.command)
+        command = shlex.split(command) if isinstance(command, str) else command
         lines.append(f"hostname {name}")
         inside = self._inside(service, image, command)
         lines.append(f"exec chroot {quoted(str(at))} {shlex.join(inside)}")
@@ -312,7 +327,10 @@ class Topology:
                 shlex.split(f"ip link add {outer} type veth peer name eth1 netns {space}"),
                 check=True,
             )
-            for line in (f"ip addr add 10.{self._net}.1.1/30 dev {outer}", f"ip link set {outer} up"):
+            for line in (
+                f"ip addr add 10.{self._net}.1.1/30 dev {outer}",
+                f"ip link set {outer} up",
+            ):
                 subprocess.run(shlex.split(line), check=True)
             self._ip(f"addr add {self.published}/30 dev eth1", "link set eth1 up", of=space)
         self._attached = {**self._spaces(), name: space}
@@ -331,7 +349,18 @@ class Topology:
 def permitted() -> bool:
     """Whether this machine lets us make namespaces and mounts."""
     tools = all(shutil.which(each) for each in ("ip", "unshare", "nsenter", "setpriv"))
-    test = ["unshare", "--mount", "--net", "--pid", "--fork", "mount", "-t", "tmpfs", "none", "/mnt"]
+    test = [
+        "unshare",
+        "--mount",
+        "--net",
+        "--pid",
+        "--fork",
+        "mount",
+        "-t",
+        "tmpfs",
+        "none",
+        "/mnt",
+    ]
     return tools and os.geteuid() == 0 and not subprocess.run(test, capture_output=True).returncode
 
 

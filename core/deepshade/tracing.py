@@ -1,8 +1,8 @@
 """Spans of client, service and trainer (OpenTelemetry), where $OTEL_TRACES_EXPORTER asks for them.
 
-`otlp` sends them to $OTEL_EXPORTER_OTLP_ENDPOINT (OTLP over HTTP), `console` prints them; the other
-variables are OpenTelemetry's own. Without the variable nothing of it is imported. A trace is carried from
-process to process by the header `traceparent` (W3C Trace Context).
+`otlp` sends them to $OTEL_EXPORTER_OTLP_ENDPOINT (OTLP over HTTP), `console` prints them; the
+other variables are OpenTelemetry's own. Without the variable nothing of it is imported. A trace is
+carried from process to process by the header `traceparent` (W3C Trace Context).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 def begin(service: str) -> bool:
     """Record spans from now on, if the variable says so; whether it does.
 
-    `service` is the name without $OTEL_SERVICE_NAME. Raises ConfigError for an exporter that there isn't, and
-    where OpenTelemetry isn't installed.
+    `service` is the name without $OTEL_SERVICE_NAME. Raises ConfigError for an exporter that there
+    isn't, and where OpenTelemetry isn't installed.
     """
     asked = os.environ.get(VARIABLE) or EXPORTERS[0]
     if asked not in EXPORTERS:

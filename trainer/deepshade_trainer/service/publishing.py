@@ -115,9 +115,8 @@ class Publisher:
 def tell(service: str, token: str | None, label: str) -> None:
     """Have a shading service look again. Raises Refused where it can't use the bundle `label`, and
     OSError where it isn't there or doesn't listen to us."""
-    request = urllib.request.Request(
-        f"{service.rstrip('/')}/bundles/reload", headers=carried(), method="POST"
-    )
+    url = f"{service.rstrip('/')}/bundles/reload"
+    request = urllib.request.Request(url, headers=carried(), method="POST")
     if token:
         request.add_header("Authorization", f"Bearer {token}")
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))

@@ -120,7 +120,7 @@ class Store:
         """How many there are by state."""
         with self._session() as session:
             query = select(Job.state, func.count()).group_by(Job.state)
-            return {state: count for state, count in session.execute(query)}
+            return dict(session.execute(query).tuples().all())
 
     def published(self) -> int:
         """How many were published."""
