@@ -144,6 +144,7 @@ def _rendering(effect: str, asked: TrainRequest, settings: Settings) -> Renderin
     if asked.scene is None:
         return None
     kind, _, rest = asked.scene.partition(":")
+    files: tuple[str, ...]
     if kind not in GENERATED:
         scene = str(confined(asked.scene, settings.data))
         files = (scene,)
