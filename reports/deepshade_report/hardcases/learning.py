@@ -93,7 +93,7 @@ def gradient(shader: Shader, bundle: Bundle, picture: Picture, precision: str) -
     with stay64() if wide else torch.autocast("cpu", enabled=False):
         loss = parse_loss(Recipe().loss)(*shader.compared(image, truth))
         loss.backward()  # type: ignore[no-untyped-call]
-    found: NDArray[np.floating[Any]] = _flat(shader)
+    found: Float = _flat(shader)
     return found
 
 
