@@ -187,6 +187,16 @@ def test_channels_are_read_where_they_lie(tmp_path, backend, begin, end):
 
 
 @pytest.mark.skipif(OPENVINO not in HERE, reason="OpenVINO isn't installed")
+def test_openvino_tells_nobody_that_it_is_used():
+    code = (
+        "import sys, deepshade.engines, openvino.tools.ovc as ovc; "
+        "print(type(ovc.telemetry).__module__, sys.modules['openvino_telemetry'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["openvino.tools.ovc.telemetry_stub", "None"]
+
+
+@pytest.mark.skipif(OPENVINO not in HERE, reason="OpenVINO isn't installed")
 def test_pieces_are_given_the_channels_that_they_take():
     from openvino import Core
 

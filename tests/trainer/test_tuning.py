@@ -149,24 +149,27 @@ def test_a_killed_job_ends_where_an_unbroken_one_does(plan: Plan, tmp_path: Path
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     for folder in (whole, parts):
         plan.write(folder)
-    command = [sys.executable, "-m", "deepshade_trainer.tuning.worker"]
-    run = subprocess.Popen([*command, str(whole)], stdin=subprocess.PIPE)
-    assert run.wait(200) == 0
+
+    def work(folder: Path) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "deepshade_trainer.tuning.worker", str(folder)]
+        return subprocess.Popen(command, stdin=subprocess.PIPE)
+
+    with work(whole) as process:
+        assert process.wait(200) == 0
     for phase, step in (("training", 5), ("judging", -1)):
-        process = subprocess.Popen([*command, str(parts)], stdin=subprocess.PIPE)
-        until = time.monotonic() + 200
-        while time.monotonic() < until and process.poll() is None:
-            last = events.last_event(parts) or {"phase": ""}
-            if last["phase"] == phase and last.get("step", -1) >= step:
-                break
-            time.sleep(0.02)
-        process.kill()
-        process.wait()
+        with work(parts) as process:
+            until = time.monotonic() + 200
+            while time.monotonic() < until and process.poll() is None:
+                last = events.last_event(parts) or {"phase": ""}
+                if last["phase"] == phase and last.get("step", -1) >= step:
+                    break
+                time.sleep(0.02)
+            process.kill()
         assert not (candidate(parts, plan) / FILE).exists()
         with (parts / events.FILE).open("a") as file:
             file.write('{"half a li')  # as the kill may leave it
-    run = subprocess.Popen([*command, str(parts)], stdin=subprocess.PIPE)
-    assert run.wait(200) == 0
+    with work(parts) as process:
+        assert process.wait(200) == 0
     models = [candidate(folder, plan) / "model.onnx" for folder in (whole, parts)]
     assert sha256(models[0]) == sha256(models[1])
     decisions = [json.loads((model.parent / FILE).read_text()) for model in models]

@@ -110,7 +110,8 @@ def _end_with_parent() -> None:
     """When nobody holds the other end of standard input any more, end at once."""
 
     def wait() -> None:
-        while sys.stdin.buffer.read(1):
+        # not by sys.stdin, whose lock a process that is forked meanwhile would wait for
+        while os.read(0, 1):
             pass
         if _rendering is not None and _rendering.poll() is None:
             os.killpg(_rendering.pid, signal.SIGKILL)
