@@ -34,7 +34,7 @@ def test_the_commands_run_the_network_without_deepshade(
     shade = exr.read(tmp_path / "ao.exr").pixels["Y"]
     assert shade.std() > 0.01
     assert exr.read(tmp_path / "aa.exr").pixels.keys() == set("RGB")
-    assert len(list((tmp_path / "graphs").glob("*.onnx"))) == 2
+    assert len(list((tmp_path / "graphs").glob("*.onnx"))) == 3  # of a size, of any, in 16 bits
     if shutil.which("g++"):
         planes = np.fromfile(tmp_path / "shade.f32", np.float32).reshape(shade.shape)
         np.testing.assert_allclose(planes, shade, atol=1e-5)
