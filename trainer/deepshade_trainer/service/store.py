@@ -120,7 +120,7 @@ class Store:
         """How many there are by state."""
         with self._session() as session:
             query = select(Job.state, func.count()).group_by(Job.state)
-            return dict(session.execute(query).tuples().all())
+            return {state: int(count) for state, count in session.execute(query)}
 
     def published(self) -> int:
         """How many were published."""
