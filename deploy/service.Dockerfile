@@ -7,6 +7,7 @@ FROM ${BASE} AS build
 WORKDIR /src
 COPY . ./
 RUN python3 -m venv /opt/deepshade
+# (OpenVINO tells its makers of its use, from a process of its own, unless a package is missing)
 # onnxruntime-gpu in place of onnxruntime serves on NVIDIA's (deploy/gpu.yml)
 ARG ENGINE=onnxruntime
 RUN /opt/deepshade/bin/pip install --no-cache-dir --no-compile -c constraints.txt '.[service,tracing]' && \
@@ -14,7 +15,7 @@ RUN /opt/deepshade/bin/pip install --no-cache-dir --no-compile -c constraints.tx
         /opt/deepshade/bin/pip uninstall -y onnxruntime && \
         /opt/deepshade/bin/pip install --no-cache-dir --no-compile -c constraints.txt "$ENGINE"; \
     fi && \
-    /opt/deepshade/bin/pip uninstall -y pip
+    /opt/deepshade/bin/pip uninstall -y openvino-telemetry pip
 
 FROM ${BASE}
 # the folders are there, and ours, so that new volumes become ours

@@ -7,11 +7,12 @@ FROM ${BASE} AS build
 WORKDIR /src
 COPY . ./
 RUN python3 -m venv /opt/deepshade
+# (OpenVINO tells its makers of its use, from a process of its own, unless a package is missing)
 # PyTorch's build: cpu, or cu130 for NVIDIA's (deploy/gpu.yml); PyPI's own is several gigabytes
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 RUN /opt/deepshade/bin/pip install --no-cache-dir --no-compile -c constraints.txt \
         --extra-index-url ${TORCH_INDEX} '.[trainer,workers,client,postgres,tracing]' && \
-    /opt/deepshade/bin/pip uninstall -y pip
+    /opt/deepshade/bin/pip uninstall -y openvino-telemetry pip
 
 FROM ${BASE}
 # Mitsuba compiles with libLLVM, for jobs that render here rather than on Ray

@@ -69,11 +69,11 @@ PANELS: tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...] = (
         (("deepshade_trainer_jobs", "{{state}}"),),
     ),
     (
-        "Loss and validation of what is training",
+        "Loss of what is training, and DSSIM where it was validated",
         "none",
         (
             ("deepshade_trainer_job_loss", "{{job}} loss"),
-            ("deepshade_trainer_job_validation", "{{job}} validation"),
+            ("deepshade_trainer_job_dssim", "{{job}} DSSIM"),
         ),
     ),
     (

@@ -3,9 +3,9 @@
     sudo python scripts/kills.py               # about ten minutes on two quiet cores
 
 Ray's worker and head while a data set is rendered: asked again, it completes, and its shards are
-byte for byte those of one that nobody disturbed. The service while pictures are asked for: clients that try
-again get every one, the same bytes. The trainer in the middle of a job: started again it goes on
-with the same job, and one version is published. That of PostgreSQL is in
+byte for byte those of one that nobody disturbed. The service while pictures are asked for: clients
+that try again get every one, the same bytes. The trainer in the middle of a job: started again it
+goes on with the same job, and one version is published. That of PostgreSQL is in
 tests/trainer/test_trainer_service.py. Ends with 1 where anything is otherwise.
 """
 

@@ -2,10 +2,10 @@
 
     python scripts/replicas.py --replicas 1 2 --seconds 20        # needs the extra `scaling`
 
-A picture of --side pixels is sent by twice as many clients as there are replicas, of one thread each.
-Where there are fewer cores than replicas they share them: the figures then say what Serve costs, not what
-more machines would bring. Then one replica gets SIGKILL under load; every picture must be
-answered, to clients that try again as `deepshade_client` does.
+A picture of --side pixels is sent by twice as many clients as there are replicas, of one thread
+each. Where there are fewer cores than replicas they share them: the figures then say what Serve
+costs, not what more machines would bring. Then one replica gets SIGKILL under load; every picture
+must be answered, to clients that try again as `deepshade_client` does.
 """
 
 from __future__ import annotations

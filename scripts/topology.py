@@ -168,12 +168,11 @@ class Topology:
             "-r",
             "-w",
         ]
-        done = subprocess.run(
-            [*enter, *self._inside(self._service(name), image, command)],
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-        )
+        inside = [*enter, *self._inside(self._service(name), image, command)]
+        try:
+            done = subprocess.run(inside, capture_output=True, text=True, timeout=timeout)
+        except subprocess.TimeoutExpired:  # its own words would show the tokens
+            raise RuntimeError(f"{shlex.join(command)} in {name} takes too long") from None
         if check and done.returncode:
             raise RuntimeError(f"{shlex.join(command)} in {name}: {done.stdout}{done.stderr}")
         return done
@@ -259,7 +258,8 @@ class Topology:
             passed = {ROOT, Path(sys.prefix), Path(sys.base_prefix), self._folder}
             parents = {p for each in passed for p in (each, *each.parents)} - {Path("/")}
             lines.append(f"chmod o+x {' '.join(quoted(f'root{p}') for p in sorted(parents))}")
-        lines += ["mount -t proc proc root/proc", "mount --rbind /dev root/dev"]
+        lines += ["mount -t proc proc root/proc", "mount -t sysfs -o ro sysfs root/sys"]
+        lines.append("mount --rbind /dev root/dev")
         shared = service.get("shm_size", "64m")
         lines.append(f"mount -t tmpfs -o size={shared},mode=1777 none root/dev/shm")
         for volume in sorted(service.get("volumes", ()), key=lambda v: v.split(":")[1]):

@@ -204,6 +204,10 @@ def _json(response: httpx.Response, kind: type[T]) -> T:
     return document
 
 
+# what balancers answer when a service that they had chosen goes away (Ray Serve: 500)
+_LOST = (500, 502, 504)
+
+
 def check(response: httpx.Response) -> None:
     """Raises the exception for a response that isn't a success."""
     if response.is_success:
@@ -214,7 +218,10 @@ def check(response: httpx.Response) -> None:
         document = None
     if not isinstance(document, dict):
         # Not from the service: a proxy in between, or something else at that address.
-        document = {"detail": f"HTTP {response.status_code} {response.reason_phrase}".strip()}
+        said = f"HTTP {response.status_code} {response.reason_phrase}".strip()
+        if response.status_code in _LOST:
+            raise ConnectionBroken(f"what is in front of the service answers {said}")
+        document = {"detail": said}
     raise problem(response.status_code, document, _retry_after(response))
 
 

@@ -35,7 +35,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     service = Service(queued=lambda: 0, held=lambda: 0)
     service.answered("/shade/{effect}", 200)
     service.shaded("ao", {"infer": 1.0}, 1, 1, 1)
-    event = {"phase": "training", "step": 1, "steps": 2, "loss": 0.1, "validation": 0.2}
+    event = {"phase": "training", "step": 1, "steps": 2, "loss": 0.1, "validation": {"dssim": 0.2}}
     event |= {"rate": 3.0, "left": 4.0}
     jobs = store(tmp_path_factory.mktemp("store"))
     text = service.render().decode() + Trainer(jobs, lambda _: event).render().decode()

@@ -21,7 +21,7 @@ _PROGRESS = (
     ("step", "step", "Steps, or views while rendering, that are done"),
     ("steps", "steps", "Steps, or views, in all"),
     ("loss", "loss", "Loss of the last steps"),
-    ("validation", "validation", "Error on views that judge the training"),
+    ("dssim", "dssim", "DSSIM on views that judge the training, at the last validation"),
     ("rate", "steps_per_second", "Steps a second"),
     ("left", "left_seconds", "Seconds left of the steps"),
 )
@@ -71,7 +71,7 @@ class Telemetry(Collector):
             "How long the first in the queue waits",
             0.0 if oldest is None else max(0.0, time.time() - oldest),
         )
-        events = [(job, self._last(job.id) or {}) for job in running]
+        events = [(job, _flat(self._last(job.id) or {})) for job in running]
         for key, name, text in _PROGRESS:
             family = GaugeMetricFamily(
                 f"deepshade_trainer_job_{name}", text, labels=["job", "effect", "phase"]
@@ -80,3 +80,8 @@ class Telemetry(Collector):
                 if isinstance(value := event.get(key), int | float):
                     family.add_metric([job.id, job.effect, str(event.get("phase", ""))], value)
             yield family
+
+
+def _flat(event: dict[str, Any]) -> dict[str, Any]:
+    """An event with its validation's figures beside the others."""
+    return event | (event.get("validation") or {})
