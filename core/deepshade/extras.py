@@ -14,9 +14,17 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 # the first of these that brings a package is the one to install for it; the report borrows
-_ORDER = ("client", "service", "live", "workers", "trainer", "report", "postgres", "cluster")
+_ORDER = (
+    *("client", "service", "live", "workers", "trainer", "report"),
+    *("postgres", "cluster", "tracing"),
+)
 # where a package isn't imported by its own name, with _ for -
-_MODULES = {"openexr": "OpenEXR", "pillow": "PIL"}
+_MODULES = {
+    "openexr": "OpenEXR",
+    "pillow": "PIL",
+    "opentelemetry-sdk": "opentelemetry.sdk",
+    "opentelemetry-exporter-otlp-proto-http": "opentelemetry.exporter.otlp.proto.http",
+}
 # imported by a package of ours rather than by us
 _INDIRECT = {"drjit": "workers", "starlette": "service", "pydantic": "service"}
 
