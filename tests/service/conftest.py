@@ -259,7 +259,7 @@ def client(service: Local) -> httpx.Client:
 
 def until(true: Callable[[], object]) -> None:
     """Wait for a condition."""
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60  # where much else is computed
     while not true():
         assert time.monotonic() < deadline, "it doesn't come true"
         time.sleep(0.005)

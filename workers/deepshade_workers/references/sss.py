@@ -27,9 +27,6 @@ LEAST = 1e-3
 NEAR = 1
 # Points of the quadrature along each edge of an outline.
 EDGE_POINTS = 8
-# Samples of the picture for each one asked for: they take no rays, and four cost about what one
-# sample of another reference does.
-PER_SAMPLE = 4
 
 
 def reference(
@@ -42,7 +39,7 @@ def reference(
     Subsurface Scattering", 2015). Each pixel's part is the integral of R over its footprint: the
     parallelogram, in the plane that touches its surface, which its sides project to. The nearest
     are integrated along their outlines, for R is singular at the receiver; the others by two
-    jittered samples in each of 2 `samples` strata of the picture about the receiver, spread as R
+    jittered samples in each of `samples`/2 strata of the picture about the receiver, spread as R
     is. Both sums are unbiased, and each pair's difference gives an unbiased variance.
 
     `images` holds "position", "scatter" and "light", all (3, H, W). Returns (3, H, W) radiance and
@@ -144,7 +141,7 @@ def _diffuse(
     inner = begin / (begin + spread)
     covered = reach / (reach + spread) - inner
     stream = pixel_streams(width * height, seed ^ STREAM)
-    columns, rows = strata(PER_SAMPLE * samples)
+    columns, rows = strata(samples)
     across, count = dr.opaque(mi.UInt32, columns), dr.opaque(mi.UInt32, columns * rows)
     size = mi.Point2f(mi.Float(across), mi.Float(dr.opaque(mi.UInt32, rows)))
 
