@@ -1,4 +1,4 @@
-"""Times every bundle on a CUDA GPU with PyTorch alone, beside the paper's network.
+"""Times every bundle on a CUDA GPU with PyTorch alone, and the paper's networks.
 
     PYTHONPATH=core:trainer python scripts/gpu.py --models models
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import partial
 from importlib.util import find_spec
@@ -24,19 +25,21 @@ from deepshade import metrics, tensors
 from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS
+from deepshade.environments import Prepared, sky
+from deepshade_trainer.lookups import lens
 from deepshade_trainer.networks import Shader, build, from_bundle
+from deepshade_trainer.networks.reflections import Reflections
 from deepshade_trainer.recipe import preset
 
 SIZES = ((768, 512), (1920, 1080), (3840, 2160))
-MODES = (  # name, as one CUDA graph, TF32, 16-bit type (but for what has to be in float32)
-    ("fp32, eager", False, False, None),
-    ("fp32", True, False, None),
-    ("TF32", True, True, None),
-    ("fp16", True, False, torch.float16),
-    ("bf16", True, False, torch.bfloat16),
+MODES = (  # name, as one CUDA graph, 16-bit type (but for what has to be in float32)
+    ("fp32, eager", False, None),
+    ("fp32", True, None),
+    ("fp16", True, torch.float16),
 )
 LAYOUTS = {torch.contiguous_format: "NCHW", torch.channels_last: "NHWC"}
-RUNS, MAX_SECONDS = 10, 0.2  # in a row; altogether
+Given = tuple[Tensor, ...]  # a picture, and what describes the environment
+RUNS, MAX_SECONDS = 10, 0.1  # in a row; altogether
 
 
 def network_input(bundle: Bundle, attributes: dict[str, Any], radius: float) -> Tensor:
@@ -55,13 +58,13 @@ def scene(bundle: Bundle, width: int, height: int) -> Tensor:
     return network_input(bundle, attributes, bundle.radius)
 
 
-def timed(network: nn.Module, ready: Tensor, mode: tuple[Any, ...]) -> tuple[float, float, Tensor]:
+def timed(network: nn.Module, ready: Given, mode: tuple[Any, ...]) -> tuple[float, float, Tensor]:
     """Median milliseconds of a run on the device, its MiB at most, and the answer."""
-    _, graph, torch.backends.cudnn.allow_tf32, dtype = mode
-    run = partial(network, ready)
+    _, graph, dtype = mode
+    run = partial(network, *ready)
     # Autocast frees its copies of the weights, which a graph reads, when this block ends.
     with torch.no_grad(), torch.autocast("cuda", dtype) if dtype else nullcontext():
-        if not ready.is_cuda:
+        if not ready[0].is_cuda:
             return np.nan, np.nan, run()
         torch.cuda.reset_peak_memory_stats()
         answer = run()
@@ -99,8 +102,8 @@ def errors(bundle: Bundle, network: nn.Module, modes: Any, device: str) -> dict[
             factor = metrics.exposure(reference) if EFFECTS[bundle.effect].is_light else 1.0
             radius = float(picture.header.get("deepshade:radius", bundle.radius))
             ready = network_input(bundle, picture.attributes, radius).to(device)
-            for name, _, *rest in modes:
-                answer = timed(network, ready, (name, False, *rest))[2].flatten(0, 1).numpy()
+            for name, _, dtype in modes:
+                answer = timed(network, (ready,), (name, False, dtype))[2].flatten(0, 1).numpy()
                 answer = answer[:, : reference.shape[1], : reference.shape[2]]
                 images = ((image * factor).clip(0, 1) for image in (answer, reference))
                 found.setdefault(name, []).append(metrics.dssim(*images))
@@ -108,18 +111,36 @@ def errors(bundle: Bundle, network: nn.Module, modes: Any, device: str) -> dict[
 
 
 def networks(models: Path) -> list[tuple[str, Bundle, nn.Module]]:
-    """The paper's network of every effect, with random weights, and every bundle's."""
+    """Every bundle's network, and the paper's of every effect, with random weights."""
     bundles = [Bundle.load(folder) for folder in bundle_folders(models)]
-    bundles = [bundle for bundle in bundles if not bundle.environment]  # those are no networks
     effects = {bundle.effect: bundle for bundle in bundles}
     papers = {name: Shader(EFFECTS[name], build(preset("paper", name).network)) for name in effects}
-    found = [(f"{name}, the paper's", effects[name], paper) for name, paper in papers.items()]
-    return found + [(f"{b.effect}/{b.name}", b, from_bundle(b.path)) for b in bundles]
+    ours = [(f"{b.effect}/{b.name}", b, module(b, bundles)) for b in bundles]
+    return ours + [(f"{name}, the paper's", effects[name], each) for name, each in papers.items()]
+
+
+def module(bundle: Bundle, among: Sequence[Bundle]) -> nn.Module:
+    """A bundle's graph as PyTorch runs it; a chain's parts are found `among` these by hash."""
+    kind = bundle.network["kind"]
+    if kind == "reflections":
+        return Reflections(bundle.network["lobes"])
+    if kind == "lens":
+        parts = {each.short_hash: each for each in among}
+        return lens(*(parts[each] for each in bundle.network["of"]), bundle.network["lobes"])
+    return from_bundle(bundle.path)
+
+
+def given(bundle: Bundle, device: str) -> list[Tensor]:
+    """What its graph takes beside a picture: a sky, prefiltered."""
+    if not bundle.environment:
+        return []
+    found = Prepared.of(sky(height=64)).inputs(bundle.environment, 30.0, "y", lambda: np.eye(3))
+    return [torch.from_numpy(found[name]).to(device) for name in bundle.environment]
 
 
 def main() -> None:
     """The command: prints a table in Markdown, row by row."""
-    torch.backends.cudnn.benchmark = True
+    torch.backends.cudnn.benchmark, torch.backends.cudnn.allow_tf32 = True, False
     parser = argparse.ArgumentParser(description="Times every bundle on a GPU with PyTorch alone.")
     parser.add_argument("--models", type=Path, default=Path("models"))
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
@@ -131,14 +152,16 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|")
     for name, bundle, network in networks(options.models):
         network.to(options.device).eval().requires_grad_()  # autocast keeps casts of such weights
-        known = "/" in name and find_spec("OpenEXR")
+        paper = "the paper's" in name  # whose weights are random, and which knows one environment
+        further = [] if paper else given(bundle, options.device)
+        known = not paper and not further and find_spec("OpenEXR")
         dssim = errors(bundle, network, modes, options.device) if known else {}
         for width, height in sizes:
             ready, exact = scene(bundle, width, height).to(options.device), None
-            for mode in modes:
+            for mode in modes if width == SIZES[0][0] else modes[1:]:
                 found = []
                 for layout, label in LAYOUTS.items():
-                    tensor = ready.contiguous(memory_format=layout)
+                    tensor = ready.contiguous(memory_format=layout), *further
                     found.append((*timed(network.to(memory_format=layout), tensor, mode), label))
                 ms, mib, answer, label = min(found, key=lambda row: row[0])  # the quicker layout
                 exact = answer if exact is None else exact

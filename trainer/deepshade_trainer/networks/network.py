@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from deepshade.errors import ConfigError
@@ -48,6 +50,11 @@ class Network(nn.Module, ABC):
 
     def prepare_export(self) -> None:
         """Lay the weights out as engines like them best; the answer stays."""
+
+
+def constant(values: Sequence[float], like: Tensor) -> Tensor:
+    """(N,), filled in on the device of `like`: no CUDA graph may hold a copy from the host."""
+    return torch.stack([like.new_full((), value) for value in values])
 
 
 def check_types(settings: Any) -> None:

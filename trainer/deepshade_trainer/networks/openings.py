@@ -16,7 +16,7 @@ from deepshade.errors import ConfigError
 from deepshade_trainer.networks import slices
 from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
 from deepshade_trainer.networks.horizons import covered, unit
-from deepshade_trainer.networks.network import Network, check_types
+from deepshade_trainer.networks.network import Network, check_types, constant
 from deepshade_trainer.networks.receptive_field import Span, folded, grown, joined
 from deepshade_trainer.networks.reflections import blurred, mean, turned
 
@@ -223,7 +223,7 @@ def _of_quarter(quarter: Tensor, around: Tensor, top: int, left: int, colours: i
             shares = [
                 _share(top + i, down) * _share(left + j, right) for i in (0, 1) for j in (0, 1)
             ]
-            near = torch.tensor(shares, device=quarter.device)[:, None, None] + 0.02
+            near = constant(shares, quarter)[:, None, None] + 0.02
             weight = near * _agreement(normal, position, there) + 1e-5 * there[:, 6:7]
             vx, vy, vz = torch.split(there[:, 7:], colours, 1)  # (N, C, 1, h, w)
             sums = sums + (vx * nx + vy * ny + vz * nz) * weight

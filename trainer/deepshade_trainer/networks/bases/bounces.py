@@ -75,6 +75,7 @@ class Bounces(Bases):
     told = 6  # normal and position as they are: a geometric trunk tells itself the horizons
     weights = 6
     size_multiple = CELL * TURNS
+    along: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,6 +84,9 @@ class Bounces(Bases):
         nn.init.normal_(last.weight, std=1e-3)
         nn.init.zeros_(last.bias)  # type: ignore[arg-type]
         self.ray = nn.Sequential(nn.Conv2d(count * _TOLD, _HIDDEN, 1), nn.ReLU(), last)
+        along = torch.tensor(DIRECTIONS, dtype=torch.float32).permute(2, 0, 1)
+        along = along.reshape(2, RAYS, _PHASES, 1)
+        self.register_buffer("along", along, persistent=False)
 
     def features(self, gbuffer: Tensor) -> tuple[Tensor, State]:
         """See `Bases.features`."""
@@ -110,13 +114,11 @@ class Bounces(Bases):
         surface = torch.cat([here, normal], 1)
         here, normal = torch.split(_by_turns(surface), 3, 1)  # (N, 3, turns h, w)
         view = unit(_by_turns(position) * -1)  # to the eye
-        along = torch.tensor(DIRECTIONS, dtype=normal.dtype, device=normal.device)
-        along = along.permute(2, 0, 1).reshape(1, 2, RAYS, _PHASES, 1)
 
         def lengthwise(vectors: Tensor) -> Tensor:
             """How far vectors (N, 3, turns h, w) go along each ray: (N, 1, rays turns h, w)."""
             flat = vectors[:, :2].reshape(count, 2, 1, _PHASES, height * width)
-            return (flat * along).sum(1).reshape(count, 1, -1, width)
+            return (flat * self.along).sum(1).reshape(count, 1, -1, width)
 
         # The ray's direction square to the view is (along - view · slant) · upright.
         slant = lengthwise(view)
@@ -170,7 +172,7 @@ class Bounces(Bases):
         share = 1 / RAYS
         side = (sums[1] * (upright * (2 * share)).reshape(size)).unsqueeze(1)
         # (N, 3, turns, h w)
-        right, up = ((side * along[:, k : k + 1]).sum(3).squeeze(1) for k in (0, 1))
+        right, up = ((side * self.along[k : k + 1]).sum(3).squeeze(1) for k in (0, 1))
         x, y, z = torch.split(view.reshape(count, 3, _PHASES, -1), 1, 1)
         depth = sums[0].sum(2) * (2 * share) - right * x - up * y
         open_ = sums[2].sum(2) * share

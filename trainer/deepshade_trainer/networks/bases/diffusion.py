@@ -22,6 +22,7 @@ from torch.nn import functional as F
 
 from deepshade_trainer.networks.bases.base import Bases, State
 from deepshade_trainer.networks.horizons import covered
+from deepshade_trainer.networks.network import constant
 from deepshade_trainer.networks.receptive_field import Span, doubled, folded, grown, joined
 
 # Levels of the pyramid: cells are 2^level pixels wide.
@@ -270,7 +271,7 @@ def _slope(place: Tensor, some: Tensor, size: Tensor) -> Tensor:
 def _blurred(both: Tensor) -> Tensor:
     """(N, 6, H, W) by a Gaussian of deviation `_SIGMA`, cut at 3 x 3."""
     side = _SIGMA**2 / 2
-    line = torch.tensor([side, 1 - 2 * side, side], device=both.device)
+    line = constant((side, 1 - 2 * side, side), both)
     kernel = (line[:, None] * line).expand(6, 1, 3, 3)
     return F.conv2d(both, kernel, padding=1, groups=6)
 
