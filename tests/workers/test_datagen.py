@@ -275,8 +275,8 @@ def running(arguments: list[str], **options: Any) -> Iterator[subprocess.Popen[b
         process.wait()
 
 
-def workers_of(parent: int, name: str = "ray::_shard_task") -> list[int]:
-    """Ray's task processes that descend from process `parent`."""
+def workers(parent: int, name: str) -> list[int]:
+    """Ray's processes of that name that descend from process `parent`."""
     listing = subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True)
     rows = [line.split(None, 2) for line in listing.stdout.splitlines()[1:]]
     above = {int(pid): int(ppid) for pid, ppid, _ in rows}
@@ -300,37 +300,9 @@ def wait_for(condition: Any, seconds: float = 240) -> Any:
     raise AssertionError("waited in vain")
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_a_killed_job_goes_on_and_a_killed_worker_costs_nothing_but_time(
-    tmp_path: Path, expected: dict[str, str]
-) -> None:
-    """One after the other, for Ray takes long to start. What it says of the dead is no JSON."""
-    job = [str(DEEPSHADE), "datagen", *command(tmp_path)]
-    with running(job) as process:
-        wait_for(lambda: list(tmp_path.glob("shard-*")))
-        os.killpg(process.pid, signal.SIGKILL)
-    # What a kill in the middle of a write leaves, and a shard that was damaged later:
-    (tmp_path / ".shard-00003.safetensors.0badcafe.tmp").write_bytes(b"half")
-    complete = next(iter(sorted(tmp_path.glob("shard-*"))))
-    complete.write_bytes(complete.read_bytes()[:-8])
-    with (tmp_path.parent / "summary.json").open("w+") as printed:
-        with running(job, stdout=printed) as process:
-            victims = wait_for(lambda: workers_of(process.pid))
-            os.kill(victims[0], signal.SIGKILL)
-            counter = wait_for(lambda: workers_of(process.pid, "ray::Tally"))
-            os.kill(counter[0], signal.SIGKILL)
-            assert process.wait(300) == 0
-        printed.seek(0)
-        assert json.load(printed)["views"] == 12
-    check(tmp_path, expected)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_a_running_cluster_takes_jobs(tmp_path: Path, expected: dict[str, str]) -> None:
-    """As `ray job submit -- deepshade datagen`, as a script, and with --address."""
-    ray = str(Path(sys.executable).with_name("ray"))
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: Any) -> Iterator[tuple[int, dict[str, str]]]:
+    """A running cluster that wants a token: its process, and the environment of its jobs."""
     environment = {
         **os.environ,
         "RAY_USAGE_STATS_ENABLED": "0",
@@ -341,38 +313,65 @@ def test_a_running_cluster_takes_jobs(tmp_path: Path, expected: dict[str, str]) 
     environment.pop("RAY_ADDRESS", None)
     ports = ["--port=9379", "--dashboard-port=9265", "--num-cpus=2"]
     ports += ["--dashboard-agent-listen-port=9266"]
+    ray = str(Path(sys.executable).with_name("ray"))
     start = [ray, "start", "--head", "--block", "--include-dashboard=true", *ports]
-    log = tmp_path / "ray.log"
-    with log.open("w") as out, running(start, env=environment, stderr=out) as cluster:
-        api = "http://127.0.0.1:9265"
-
-        answers = []
-
-        def submit(*arguments: str) -> bool:
-            done = subprocess.run(
-                [ray, "job", "submit", "--address", api, "--", *arguments],
-                env=environment,
-                capture_output=True,
-                timeout=240,
-            )
-            answers.append(done.stderr.decode()[-2000:])
-            return done.returncode == 0
-
+    log = tmp_path_factory.mktemp("cluster") / "ray.log"
+    with log.open("w") as out, running(start, env=environment, stderr=out) as process:
         try:
-            wait_for(lambda: cluster.poll() is None and answers_at(9265))
-            # an agent that isn't up yet refuses it
-            wait_for(lambda: submit(str(DEEPSHADE), "datagen", *command(tmp_path / "job")))
+            wait_for(lambda: process.poll() is None and answers_at(9265))
         except AssertionError:
-            raise AssertionError(f"no cluster: {log.read_text()} {answers[-1:]}") from None
-        check(tmp_path / "job", expected)
+            raise AssertionError(f"no cluster: {log.read_text()}") from None
+        yield process.pid, environment
 
-        address = {**environment, "RAY_ADDRESS": "127.0.0.1:9379"}
-        script = [sys.executable, str(ROOT / "scripts/ray_datagen.py")]
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_cluster_takes_a_submitted_job(
+    tmp_path: Path, expected: dict[str, str], cluster: tuple[int, dict[str, str]]
+) -> None:
+    """As `ray job submit -- deepshade datagen`."""
+    ray, answers = str(Path(sys.executable).with_name("ray")), []
+
+    def submit(*arguments: str) -> bool:
         done = subprocess.run(
-            [*script, *command(tmp_path / "script")], env=address, capture_output=True, timeout=240
+            [ray, "job", "submit", "--address", "http://127.0.0.1:9265", "--", *arguments],
+            env=cluster[1],
+            capture_output=True,
+            timeout=240,
         )
-        assert done.returncode == 0, done.stderr
-        check(tmp_path / "script", expected)
+        answers.append(done.stderr.decode()[-2000:])
+        return done.returncode == 0
+
+    try:  # an agent that isn't up yet refuses it
+        wait_for(lambda: submit(str(DEEPSHADE), "datagen", *command(tmp_path / "job")))
+    except AssertionError:
+        raise AssertionError(answers[-1]) from None
+    check(tmp_path / "job", expected)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_killed_job_goes_on_and_a_killed_worker_costs_nothing_but_time(
+    tmp_path: Path, expected: dict[str, str], cluster: tuple[int, dict[str, str]]
+) -> None:
+    """As a script, then with --address. What Ray says of the dead is no JSON."""
+    script = [sys.executable, str(ROOT / "scripts/ray_datagen.py"), *command(tmp_path)]
+    with running(script, env={**cluster[1], "RAY_ADDRESS": "127.0.0.1:9379"}) as process:
+        wait_for(lambda: list(tmp_path.glob("shard-*")))
+        os.killpg(process.pid, signal.SIGKILL)
+    # What a kill in the middle of a write leaves, and a shard that was damaged later:
+    (tmp_path / ".shard-00003.safetensors.0badcafe.tmp").write_bytes(b"half")
+    complete = next(iter(sorted(tmp_path.glob("shard-*"))))
+    complete.write_bytes(complete.read_bytes()[:-8])
+    job = [str(DEEPSHADE), "datagen", *command(tmp_path), "--address", "127.0.0.1:9379"]
+    with (tmp_path.parent / "summary.json").open("w+") as printed:
+        with running(job, stdout=printed, env=cluster[1]) as process:
+            for name in ("ray::_shard_task", "ray::Tally"):
+                os.kill(wait_for(lambda name=name: workers(cluster[0], name))[0], signal.SIGKILL)
+            assert process.wait(300) == 0
+        printed.seek(0)
+        assert json.load(printed)["views"] == 12
+    check(tmp_path, expected)
 
 
 def answers_at(port: int) -> bool:
