@@ -109,7 +109,7 @@ def judges(tmp_path_factory: Any) -> Path:
     return write_data(tmp_path_factory.mktemp("judges") / "test", 2)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def plan(base: Path, data: Path, judges: Path) -> Plan:
     """A job that makes `base` better in moments."""
     return Plan(

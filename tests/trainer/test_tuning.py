@@ -8,6 +8,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -113,14 +114,23 @@ def test_the_same_job_has_the_same_key_and_another_one_another(plan: Plan, tmp_p
         replace(plan, minutes=float("nan"))
 
 
+@pytest.fixture(scope="module")
+def finished(plan: Plan, tmp_path_factory: Any) -> tuple[Path, list[dict[str, Any]]]:
+    """The folder of `plan`'s job, which nothing broke, and its events."""
+    folder = tmp_path_factory.mktemp("finished")
+    return folder, list(finetune(plan, folder))
+
+
 @pytest.mark.slow
-def test_a_job_ends_with_a_better_bundle_and_its_decision(plan: Plan, tmp_path: Path) -> None:
-    found = list(finetune(plan, tmp_path))
+def test_a_job_ends_with_a_better_bundle_and_its_decision(
+    plan: Plan, finished: tuple[Path, list[dict[str, Any]]]
+) -> None:
+    folder, found = finished
     steps = [each for each in found if each["phase"] == "training"]
     assert [each["step"] for each in steps] == list(range(plan.steps + 1))
     assert steps[-1]["left"] == 0
-    assert Run(tmp_path / "run").preview.read_bytes().startswith(b"\x89PNG")
-    bundle = Bundle.load(candidate(tmp_path, plan))
+    assert Run(folder / "run").preview.read_bytes().startswith(b"\x89PNG")
+    bundle = Bundle.load(candidate(folder, plan))
     decision = json.loads((bundle.path / FILE).read_text())
     assert decision == found[-1]["decision"]
     assert decision["better"]
@@ -128,7 +138,7 @@ def test_a_job_ends_with_a_better_bundle_and_its_decision(plan: Plan, tmp_path: 
     assert decision["candidate"]["sha256"] == bundle.sha256
     assert "Fine-tuned" in (bundle.path / "README.md").read_text()
     # done is done: nothing is trained, or measured, again
-    assert list(finetune(plan, tmp_path)) == [{"phase": "judged", "decision": decision}]
+    assert list(finetune(plan, folder)) == [{"phase": "judged", "decision": decision}]
 
 
 @pytest.mark.slow
@@ -144,20 +154,19 @@ def test_what_cant_help_is_not_better(plan: Plan, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_job_ends_where_an_unbroken_one_does(plan: Plan, tmp_path: Path) -> None:
+def test_a_killed_job_ends_where_an_unbroken_one_does(
+    plan: Plan, finished: tuple[Path, list[dict[str, Any]]], tmp_path: Path
+) -> None:
     """`kill -9` in the middle of training, and again while the result is judged."""
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    for folder in (whole, parts):
-        plan.write(folder)
+    whole, parts = finished[0], tmp_path / "parts"
+    plan.write(parts)
 
-    def work(folder: Path) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "deepshade_trainer.tuning.worker", str(folder)]
+    def work() -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "deepshade_trainer.tuning.worker", str(parts)]
         return subprocess.Popen(command, stdin=subprocess.PIPE)
 
-    with work(whole) as process:
-        assert process.wait(200) == 0
     for phase, step in (("training", 5), ("judging", -1)):
-        with work(parts) as process:
+        with work() as process:
             until = time.monotonic() + 200
             while time.monotonic() < until and process.poll() is None:
                 last = events.last_event(parts) or {"phase": ""}
@@ -168,7 +177,7 @@ def test_a_killed_job_ends_where_an_unbroken_one_does(plan: Plan, tmp_path: Path
         assert not (candidate(parts, plan) / FILE).exists()
         with (parts / events.FILE).open("a") as file:
             file.write('{"half a li')  # as the kill may leave it
-    with work(parts) as process:
+    with work() as process:
         assert process.wait(200) == 0
     models = [candidate(folder, plan) / "model.onnx" for folder in (whole, parts)]
     assert sha256(models[0]) == sha256(models[1])
