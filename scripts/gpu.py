@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import partial
 from importlib.util import find_spec
@@ -26,9 +25,7 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.effects import EFFECTS
 from deepshade.environments import Prepared, sky
-from deepshade_trainer.lookups import lens
 from deepshade_trainer.networks import Shader, build, from_bundle
-from deepshade_trainer.networks.reflections import Reflections
 from deepshade_trainer.recipe import preset
 
 SIZES = ((768, 512), (1920, 1080), (3840, 2160))
@@ -115,19 +112,8 @@ def networks(models: Path) -> list[tuple[str, Bundle, nn.Module]]:
     bundles = [Bundle.load(folder) for folder in bundle_folders(models)]
     effects = {bundle.effect: bundle for bundle in bundles}
     papers = {name: Shader(EFFECTS[name], build(preset("paper", name).network)) for name in effects}
-    ours = [(f"{b.effect}/{b.name}", b, module(b, bundles)) for b in bundles]
+    ours = [(f"{b.effect}/{b.name}", b, from_bundle(b.path)) for b in bundles]
     return ours + [(f"{name}, the paper's", effects[name], each) for name, each in papers.items()]
-
-
-def module(bundle: Bundle, among: Sequence[Bundle]) -> nn.Module:
-    """A bundle's graph as PyTorch runs it; a chain's parts are found `among` these by hash."""
-    kind = bundle.network["kind"]
-    if kind == "reflections":
-        return Reflections(bundle.network["lobes"])
-    if kind == "lens":
-        parts = {each.short_hash: each for each in among}
-        return lens(*(parts[each] for each in bundle.network["of"]), bundle.network["lobes"])
-    return from_bundle(bundle.path)
 
 
 def given(bundle: Bundle, device: str) -> list[Tensor]:

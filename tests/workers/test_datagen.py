@@ -155,7 +155,6 @@ def surrounded(tmp_path_factory: Any) -> tuple[DataSpec, Path, Shard]:
         effects=("do", "full"),
         environments=str(maps),
         skies=2,
-        layers=("do_directions",),
     )
     out = tmp_path_factory.mktemp("surrounded")
     return spec, out, make_shard(spec, 0, out, lambda: None)
@@ -170,7 +169,6 @@ def test_each_view_has_its_environment(surrounded: tuple[DataSpec, Path, Shard])
     assert any(name.startswith("sky-") for name in names)
     assert len({record["rotate"] for record in shard.samples}) == 5
     tensors = load_file(out / shard.file)
-    assert tensors["reference_do_directions"].shape == (5, 64, 32, 32)
     for index, record in enumerate(shard.samples):
         found = read_stored(out, record["environment_sha256"], record["environment"])
         assert found.shape[0] <= MAX_HEIGHT
@@ -197,7 +195,7 @@ def test_a_lost_map_is_written_again(surrounded: tuple[DataSpec, Path, Shard]) -
 
 def test_without_environments_settings_stay_as_they_were() -> None:
     """Data sets that were begun before there were any go on."""
-    assert not {"environments", "skies", "layers"} & set(SPEC.settings())
+    assert not {"environments", "skies"} & set(SPEC.settings())
     with_sky = replace(SPEC, effects=("do",))
     assert with_sky.settings()["skies"] == SPEC.skies
 
@@ -223,7 +221,6 @@ def test_scene_names_expand(tmp_path: Path) -> None:
         {"shard_size": 0},
         {"radius": -1.0},
         {"effects": ("ao", "nothing")},
-        {"layers": ("visibility",)},
         {"effects": ("do",), "skies": 0},
         {"effects": ("do",), "environments": "/nowhere"},
     ],
@@ -418,5 +415,3 @@ def test_augmented_views_are_stored_in_all_their_turns(tmp_path: Path) -> None:
     assert _complete(spec, 0, manifest, tmp_path)
     assert not _complete(plain, 0, manifest, tmp_path)
     assert "augment" not in plain.settings()  # older sets can still be completed
-    with pytest.raises(ConfigError, match="--layers"):
-        replace(spec, effects=("do",), layers=("do_directions",))

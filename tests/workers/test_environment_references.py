@@ -11,10 +11,9 @@ import pytest
 from deepshade.camera import Camera, rotation_of
 from deepshade.environments import Environment, directions, solid_angles, world_to_map
 from deepshade.environments.harmonics import harmonics
-from deepshade.environments.lamps import DIRECTIONS
 from deepshade.errors import ConfigError
 from deepshade_workers.environments import EnvironmentLight
-from deepshade_workers.references import ao, do, full, ibl, layer_of
+from deepshade_workers.references import ao, do, full, ibl
 from deepshade_workers.scenes.mesh import merge
 from deepshade_workers.scenes.procedural.primitives import place, sphere
 from deepshade_workers.scenes.scene import Scene
@@ -140,30 +139,6 @@ def test_a_sun_does_not_sparkle(corner: Scene, above: Camera) -> None:
         value, error = rendered(module, corner, light)
         lit = value[0] > np.median(value[0])
         assert (error[0][lit] < 0.2 * value[0][lit]).all()
-
-
-def test_open_directions_add_up_to_directional_occlusion(corner: Scene, above: Camera) -> None:
-    """Under as many lamps: ambient occlusion where all are alike, and exactly a single one."""
-    view, hits = under(filled(), above), trace(corner, above, SIDE, SIDE)
-    layer = layer_of("do_directions")
-    found, error = layer.render(corner, view, hits, {}, samples=1, seed=0)
-    assert error is None
-    assert found.shape == (layer.channels, SIDE, SIDE)
-    open_ = np.unpackbits(found.astype(np.uint8), axis=0).reshape(len(DIRECTIONS), -1)
-    seen = rotation_of(above.matrix) @ hits.ns.numpy().astype(np.float64)
-    cosines = DIRECTIONS @ seen
-    assert not open_[cosines < -1e-6].any()
-    occlusion, _ = rendered(ao, corner, view, samples=1024)
-    total = (open_ * cosines).sum(0) / np.maximum(cosines, 0).sum(0)
-    assert total == pytest.approx(occlusion.ravel(), abs=0.05)
-    assert (total - occlusion.ravel()).mean() == pytest.approx(0, abs=0.005)
-    # The wall, endless, ends at a radius of 1: what is nearer than that stops a ray towards it.
-    _, y, z = hits.p.numpy()
-    floor, toward = y < 1e-3, (rotation_of(above.matrix).T @ DIRECTIONS.T)
-    for k in np.flatnonzero(toward[1] > 0.3)[::7]:
-        far = (z + 1) / np.maximum(-toward[2, k], 1e-9)  # along the ray to the wall
-        clear = np.abs(far - 1) > 1e-3
-        assert (open_[k] == (far > 1))[floor & clear].all()
 
 
 def test_background_is_the_maps_mean(ahead: Camera) -> None:

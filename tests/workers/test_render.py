@@ -89,7 +89,7 @@ def test_an_environment_is_named_in_the_header(tmp_path: Path) -> None:
     path = tmp_path / "dusk.exr"
     exr.write(path, dict(zip("RGB", made.radiance, strict=True)))
     options = ["--spp", "32", "--aperture", "0.1", "--environment", str(path), "--rotate", "30"]
-    options += ["--effects", "do,ibl,full", "--layers", "do_directions"]
+    options += ["--effects", "do,ibl,full"]
     assert main(["render", SCENE, "-o", str(tmp_path / "a.exr"), *VIEW, *options]) == 0
     found = exr.read(tmp_path / "a.exr")
     header = found.header.parts[0].attributes
@@ -101,8 +101,6 @@ def test_an_environment_is_named_in_the_header(tmp_path: Path) -> None:
         assert np.isfinite(planes).all()
         assert np.min(planes) >= 0
         assert np.std(planes) > 0.05
-    assert 0 < found.pixels["reference_do_directions.63"].max() <= 255
-    assert not any(name.startswith("reference_do_directions_error") for name in found.pixels)
 
 
 def test_only_the_attributes_asked_for(tmp_path: Path) -> None:
@@ -132,7 +130,6 @@ def test_json_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (["--effects", "ibl"], "ibl needs an environment map: --environment FILE"),
         (["--environment", "nothing.hdr"], "nothing.hdr"),
         (["--environment", "sky", "--rotate", "inf"], "rotate"),
-        (["--layers", "visibility"], "do_directions"),
         (["--radius", "-1"], "radius"),
         (["--radius", "nan"], "radius"),
         (["--fov", "180"], "field of view"),

@@ -164,14 +164,15 @@ class Dataset:
         given = self.effect, sample, self.effect.inputs, radius
         return tensors.tensor(*given, per_channel=self.per_channel, multiple=multiple)
 
-    def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, ...]:
+    def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:
         """G-buffers (N, C, H, W) and references (N, outputs, H, W) to learn from.
 
         Each sample is turned by one of the effect's symmetries (`turn`); some have 16-bit lengths,
         some directions that are too short; networks run per channel see one colour channel.
         """
-        drawn = [self._drawn(number, rng) for number in numbers]
-        return tuple(torch.from_numpy(np.stack(each)) for each in zip(*drawn, strict=True))
+        drawn = zip(*(self._drawn(number, rng) for number in numbers), strict=True)
+        gbuffers, references = (torch.from_numpy(np.stack(each)) for each in drawn)
+        return gbuffers, references
 
     def turn(self, number: int, rng: np.random.Generator) -> int:
         """A symmetry of the effect to turn a sample by; none for one that is a stored turn itself.
@@ -182,17 +183,9 @@ class Dataset:
         return 0 if "turn" in self.entries[number].record else drawn
 
     def _drawn(self, number: int, rng: np.random.Generator) -> tuple[NDArray[np.float32], ...]:
-        sample = self.load(number)
+        sample, effect = self.load(number), self.effect
         turn = self.turn(number, rng)
         reference = symmetry.apply(sample[self.reference], None, turn)
-        gbuffer, channel = self._seen(number, sample, turn, rng)
-        return gbuffer, reference if channel is None else reference[channel : channel + 1]
-
-    def _seen(
-        self, number: int, sample: Sample, turn: int, rng: np.random.Generator
-    ) -> tuple[NDArray[np.float32], int | None]:
-        """A sample's G-buffer (C, H, W), turned and with its flaws, and which colour it is of."""
-        effect = self.effect
         turned = {name: symmetry.apply(sample[name], name, turn) for name in self.effect.inputs}
         if rng.random() < HALF_LENGTHS:
             turned |= {name: rounded(turned[name]) for name in lengths(effect.inputs)}
@@ -202,19 +195,20 @@ class Dataset:
         scale = tensors.length_scale(effect, turned, self.radius(number))
         planes = tensors.planes(turned, effect.inputs, scale, channel=channel)
         height, width = planes[0].pixels.shape
-        return tensors.cut(planes, (0, height, 0, width))[0], channel
+        gbuffer = tensors.cut(planes, (0, height, 0, width))[0]
+        return gbuffer, reference if channel is None else reference[channel : channel + 1]
 
-    def judged(self, number: int) -> tuple[Tensor, tuple[Tensor, ...], Sample]:
+    def judged(self, number: int) -> tuple[Tensor, Sample]:
         """What networks are validated on.
 
-        A G-buffer (N, C, H, W), what else the network is given, and the sample: attributes, the
-        reference and the answer of doing nothing ("trivial"), all (C, H, W).
+        A G-buffer (N, C, H, W) and the sample: attributes, the reference and the answer of doing
+        nothing ("trivial"), all (C, H, W).
         """
         sample = self.load(number)
         sample["trivial"] = judging.trivial(
             self.effect, sample, sample[self.reference], self.surroundings(number)
         )
-        return torch.from_numpy(self.gbuffer(sample, self.radius(number))), (), sample
+        return torch.from_numpy(self.gbuffer(sample, self.radius(number))), sample
 
 
 def lengths(names: Iterable[str]) -> list[str]:
@@ -253,7 +247,6 @@ class Batch:
     numbers: list[int]
     gbuffer: Tensor
     reference: Tensor
-    light: tuple[Tensor, ...] = ()  # what else `Shader.lit` takes
 
 
 def batches(
@@ -274,8 +267,7 @@ def batches(
                     return
                 chosen = _chosen(numbers, size, seed, step)
                 rng = np.random.default_rng([seed, step, 1])
-                gbuffer, reference, *light = data.batch(chosen, rng)
-                queue.put(Batch(step, chosen, gbuffer, reference, tuple(light)))
+                queue.put(Batch(step, chosen, *data.batch(chosen, rng)))
         except BaseException as error:  # handed to the training loop
             queue.put(error)
 

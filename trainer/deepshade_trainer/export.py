@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import asdict
@@ -31,7 +31,7 @@ from deepshade_trainer.graph import (
     int8_ranges,
     session,
 )
-from deepshade_trainer.networks import Shader, build
+from deepshade_trainer.networks import NetworkConfig, Shader, build
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.run import Run
 
@@ -74,20 +74,60 @@ def export(
     Raises DataError: the difference exceeds `TOLERANCE`; no configuration is then written.
     """
     recipe, shader = load_shader(run)
-    effect = EFFECTS[recipe.effect]
     trained, held = gbuffers(recipe, data, shader.per_channel, shader.size_multiple)
+    pictures, rounded = [each.numpy() for each in trained], shader.network.rounded or ""
+    return write_bundle(
+        shader,
+        recipe.network,
+        folder,
+        held,
+        ranges={
+            name: (
+                min(float(each[:, place].min()) for each in pictures),
+                max(float(each[:, place].max()) for each in pictures),
+            )
+            for name, place in shader.places.items()
+        },
+        int8=lambda graph: int8_ranges(graph, INPUT, pictures, rounded),
+        radius=radius,
+        fov=fov,
+        metrics=metrics,
+    )
+
+
+def write_bundle(
+    shader: Shader,
+    network: NetworkConfig,
+    folder: Path,
+    pictures: Sequence[Tensor],
+    *,
+    ranges: Mapping[str, tuple[float, float]],
+    int8: Callable[[Any], Mapping[str, tuple[float, float]]],
+    radius: float = 1.0,
+    fov: float = 50.0,
+    metrics: dict[str, Any] | None = None,
+) -> tuple[Bundle, float]:
+    """The bundle `folder` of a shader whose `network` is so configured, and its parity.
+
+    That is proven on `pictures`, G-buffers (N, C, H, W); `int8` gives its entry in the
+    configuration for a graph. The rest as in `export` and `Bundle`.
+
+    Raises DataError: the difference exceeds `TOLERANCE`; no configuration is then written.
+    """
+    effect, rounded = shader.effect, shader.network.rounded
     folder.mkdir(parents=True, exist_ok=True)
     with scratch(folder / MODEL) as file:  # what is there stays until all is done
         graph = write_onnx(shader, file)
         given = some_light(shader)
-        worst = parity(shader, file, held)
+        worst = parity(shader, file, pictures)
         if not worst <= TOLERANCE:
             raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
         side = up(_SIDE, shader.size_multiple)
-        rounded = shader.network.rounded
-        float32, after = float32_marks(graph, rounded)
+        float32, after = [OUTPUT], []
+        if rounded is not None:
+            float32, after = float32_marks(graph, rounded)
         config = {
-            "effect": recipe.effect,
+            "effect": effect.name,
             "name": folder.name,
             "inputs": effect.inputs,
             "outputs": effect.outputs,
@@ -95,19 +135,13 @@ def export(
             "fov": fov,
             "size_multiple": shader.size_multiple,
             "halo": shader.halo,
-            "ranges": {
-                name: (
-                    min(float(each[:, place].min()) for each in trained),
-                    max(float(each[:, place].max()) for each in trained),
-                )
-                for name, place in shader.places.items()
-            },
+            "ranges": dict(ranges),
             "bytes_per_pixel": bytes_per_pixel(graph, INPUT, (shader.channels, side, side), given),
             "per_channel": shader.per_channel,
             "float32": float32,
             "float32_after": after,
-            "int8": int8_ranges(graph, INPUT, [each.numpy() for each in trained], rounded, given),
-            "network": asdict(recipe.network),
+            "int8": dict(int8(graph)),
+            "network": asdict(network),
             **({"environment": list(given)} if given else {}),
             "input_name": INPUT,
             "output_name": OUTPUT,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
@@ -15,7 +16,7 @@ from deepshade.errors import ConfigError
 from deepshade.files import replacing
 from deepshade.tensors import channel_count, channel_slices
 from deepshade_trainer.losses import parse_loss
-from deepshade_trainer.networks import FoldConfig, NetworkConfig, network_config
+from deepshade_trainer.networks import FoldConfig, NetworkConfig, check_learns, network_config
 from deepshade_trainer.networks.network import check_types
 
 CHOICES = {
@@ -64,6 +65,7 @@ class Recipe:
                     choices,
                     detail=f"{key} must be one of {', '.join(choices)}, not {getattr(self, key)!r}",
                 )
+        check_learns(self.effect, self.network.kind)
         parse_loss(self.loss)
         for key in ("batch", "steps"):
             if getattr(self, key) < 1:
@@ -104,10 +106,12 @@ class Recipe:
         return cls().changed(**json.loads(path.read_text()))
 
 
-def preset(name: str, effect: str) -> Recipe:
+def preset(name: str, effect: str, network: Mapping[str, Any] | None = None) -> Recipe:
     """The recipe of a preset for an effect, from `deepshade_trainer.presets.<effect>`.
 
-    Raises ConfigError if either is unknown.
+    `network` stands in the place of the preset's own, if given.
+
+    Raises ConfigError if either is unknown, or the preset's network is calculated.
     """
     if effect not in EFFECTS:
         raise ConfigError(effect, EFFECTS, detail=f"no effect {effect!r}: {', '.join(EFFECTS)}")
@@ -118,7 +122,8 @@ def preset(name: str, effect: str) -> Recipe:
     if name not in presets:
         raise ConfigError(name, presets, detail=f"no preset {name!r}: {', '.join(presets)}")
     settings = dict(presets[name])
-    network = settings.pop("network", {})
+    own = settings.pop("network", {})
+    network = dict(network or own)
     recipe = Recipe(effect, network_config(_channels(EFFECTS[effect], network.get("kind", "fold"))))
     return recipe.changed(network=network, **settings)
 
@@ -136,8 +141,6 @@ def _channels(effect: Effect, kind: str) -> dict[str, Any]:
     }
     places = channel_slices(effect.inputs, per_channel)
     geometric = effect.lengths == "radius" and {"normal", "position"} <= places.keys()
-    if kind in ("fold", "openings") and geometric:
+    if kind == "fold" and geometric:
         found |= {name: places[name].start for name in ("normal", "position")}
-    if kind == "openings" and "normal_world" in places:
-        found["world"] = places["normal_world"].start
     return found

@@ -22,10 +22,8 @@ from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing
 from deepshade_trainer.dataset import Batch, Dataset, batches
-from deepshade_trainer.lit import Lit
 from deepshade_trainer.losses import parse_loss
 from deepshade_trainer.networks import Network, Shader, build, bundle_weights
-from deepshade_trainer.networks.openings import Openings
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
@@ -105,9 +103,7 @@ class _Trainer:
         self.shader = Shader(EFFECTS[recipe.effect], self.network)
         runs = self.shader.per_channel
         self.data: Dataset
-        if isinstance(self.network, Openings):
-            self.data = Lit(folders, recipe.effect)
-        elif self.device.type == "cpu":
+        if self.device.type == "cpu":
             self.data = Dataset(folders, recipe.effect, per_channel=runs)
         else:
             self.data = Resident(folders, recipe.effect, per_channel=runs, device=self.device)
@@ -143,7 +139,7 @@ class _Trainer:
         step = max(1, len(held) // (2 * VALIDATION_SAMPLES))
         found = []
         for number in held[::step]:
-            _, _, sample = self.data.judged(number)
+            _, sample = self.data.judged(number)
             if not all(np.isfinite(plane).all() for plane in sample.values()):
                 self.warnings.append(f"not validated on: {self.data.entries[number].name}")
                 continue
@@ -188,8 +184,6 @@ class _Trainer:
         else:
             raise ConfigError("init_from", detail=f"{folder} is no run to start from, nor a bundle")
         own = self.network.state_dict()
-        # a network may have as a part of it what another is
-        weights = {f"trunk.{k}": w for k, w in weights.items()} | weights
         known = {k: w for k, w in weights.items() if k in own and own[k].shape == w.shape}
         if not known:
             raise ConfigError(
@@ -271,9 +265,8 @@ class _Trainer:
             return math.nan, "non-finite samples"
         self.shader.train()
         mixed = recipe.precision == "bf16"
-        given = [self._own(each) for each in batch.light]
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
-            image = answered(self.shader, gbuffer, given)
+            image = answered(self.shader, gbuffer)
         loss = self.loss(*self.shader.compared(image, reference))
         self.optimizer.zero_grad(set_to_none=True)
         if self._any(not torch.isfinite(loss)):

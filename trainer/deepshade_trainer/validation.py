@@ -24,12 +24,10 @@ class Validated:
     picture: Tensor
 
 
-def answered(shader: Shader, gbuffer: Tensor, given: Sequence[Tensor]) -> Tensor:
+def answered(shader: Shader, gbuffer: Tensor) -> Tensor:
     """The answer on the transfer curve, as large as the G-buffer."""
     height, width = gbuffer.shape[2:]
-    padded = shader.padded(gbuffer)
-    image = shader.lit(padded, *given) if given else shader.on_curve(padded)
-    return image[:, :, :height, :width]
+    return shader.on_curve(shader.padded(gbuffer))[:, :, :height, :width]
 
 
 def validated(
@@ -37,10 +35,9 @@ def validated(
 ) -> Iterator[Validated]:
     """The errors of a shader in evaluation mode over these samples, exposed and clipped."""
     for number in numbers:
-        gbuffer, light, sample = data.judged(number)
-        given = [each.to(device) for each in light]
+        gbuffer, sample = data.judged(number)
         with torch.inference_mode():
-            found = shader.bounded(answered(shader, gbuffer.to(device), given))
+            found = shader.bounded(answered(shader, gbuffer.to(device)))
         answer = found.cpu().flatten(0, 1).numpy()
         reference, blank = sample[data.reference], sample["trivial"]
         image, truth, nothing = (

@@ -81,9 +81,6 @@ def render(
     attributes: Annotated[
         str, typer.Option(help="Attributes to write, commas between. Default: all.")
     ] = "",
-    layers: Annotated[
-        str, typer.Option(help="More to render, commas between: do_directions.")
-    ] = "",
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Render a view: every canonical attribute, the camera, and the references of EFFECTS.
@@ -105,7 +102,7 @@ def render(
     from deepshade.attributes import ATTRIBUTES
     from deepshade.camera import Camera
     from deepshade.errors import ConfigError
-    from deepshade_workers.references import layer_of, require
+    from deepshade_workers.references import require
     from deepshade_workers.render import render as render_view
     from deepshade_workers.scenes.loading import open_scene
     from deepshade_workers.scenes.summary import warn
@@ -115,9 +112,6 @@ def render(
         raise ConfigError("radius", detail=f"the radius must be above 0, not {radius}")
     names = _listed(effects)
     require(names)
-    more = _listed(layers)
-    for name in more:
-        layer_of(name)
     chosen = _listed(attributes)
     for name in chosen:
         if name not in ATTRIBUTES:
@@ -139,7 +133,7 @@ def render(
     )
     shown = chosen or list(ATTRIBUTES)
     figures = render_view(
-        opened, view, output, effects=names, attributes=shown, layers=more, samples=spp, seed=seed
+        opened, view, output, effects=names, attributes=shown, samples=spp, seed=seed
     )
     if as_json:
         typer.echo(json.dumps(figures))
@@ -283,9 +277,6 @@ def datagen(
         ),
     ] = None,
     skies: Annotated[int, typer.Option(help="How many different skies.", min=0)] = 64,
-    layers: Annotated[
-        str, typer.Option(help="More to render, commas between: do_directions.")
-    ] = "",
     augment: Annotated[
         bool,
         typer.Option(
@@ -314,7 +305,7 @@ def datagen(
         --effects ao,gi --textures pictures --views 2048
 
       deepshade datagen --out data/env --scenes procedural --effects do,ibl,full \
-        --environments maps --layers do_directions --views 2048
+        --environments maps --views 2048
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
@@ -339,7 +330,6 @@ def datagen(
         textures=None if textures is None else str(textures),
         environments=None if environments is None else str(environments),
         skies=skies,
-        layers=tuple(_listed(layers)),
         augment=augment,
     )
     warn(notes_of(spec.scenes))

@@ -21,7 +21,7 @@ from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import NAME, Manifest, Shard
 from deepshade_workers.maps import map_files
-from deepshade_workers.references import layer_of, require
+from deepshade_workers.references import require
 from deepshade_workers.scenes.loading import (
     COMPOSED,
     PROCEDURAL,
@@ -53,8 +53,8 @@ class DataSpec:
     each view, up to `max_blur`, `max_motion` and `max_scatter` pixels (`view.Limits`), with
     pictures from the folder `textures` among their textures. Effects under an environment get, for
     each view, a map of the folder `environments` or one of `skies` generated ones, and a rotation.
-    `layers` (`references.layer_of`) come beside the references. With `augment` each view is stored
-    in all turns and mirrors that its effects have (`turns`), and `views` counts it once.
+    With `augment` each view is stored in all turns and mirrors that its effects have (`turns`), and
+    `views` counts it once.
     """
 
     scenes: tuple[str, ...]
@@ -73,7 +73,6 @@ class DataSpec:
     textures: str | None = None
     environments: str | None = None
     skies: int = 64
-    layers: tuple[str, ...] = ()
     augment: bool = False
 
     def __post_init__(self) -> None:
@@ -92,10 +91,6 @@ class DataSpec:
         if not self.effects:
             raise ConfigError("effects", detail="no effects were given: --effects ao, say")
         require(self.effects)
-        for name in self.layers:
-            layer_of(name)
-        if self.augment and self.layers:
-            raise ConfigError("augment", detail="--augment can't turn --layers: leave one out")
         if self.environments is not None:
             map_files(self.environments)
         elif self.surrounded and not self.skies:
@@ -152,10 +147,6 @@ class DataSpec:
                 del found[key]
         if not self.surrounded:
             del found["environments"], found["skies"]
-        if self.layers:
-            found["layers"] = list(self.layers)
-        else:
-            del found["layers"]
         if not self.augment:
             del found["augment"]
         return found
@@ -258,7 +249,6 @@ def _rendered(
         spec.size,
         spec.size,
         effects=spec.effects,
-        layers=spec.layers,
         samples=spec.spp,
         seed=noise,
     )
@@ -268,7 +258,7 @@ def _rendered(
 
 def make_shard(spec: DataSpec, index: int, folder: Path, tick: Callable[[], object]) -> Shard:
     """Render and write shard `index`, its environment maps first; `tick` after each sample."""
-    tensors = schema(spec.effects, spec.size, spec.layers)
+    tensors = schema(spec.effects, spec.size)
     images, records = [], []
     for number in spec.samples(index):
         sample, record, view = _rendered(spec, number)

@@ -13,7 +13,7 @@ from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade_workers.attributes import make_attributes
-from deepshade_workers.references import layer_of, reference_of
+from deepshade_workers.references import reference_of
 from deepshade_workers.sampling import rays_used
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import trace
@@ -28,31 +28,28 @@ def render_sample(
     *,
     effects: Iterable[str],
     attributes: Iterable[str] = (),
-    layers: Iterable[str] = (),
     samples: int,
     seed: int,
 ) -> Images:
     """Trace the `width` x `height` window of `view`'s camera: planar (C, H, W) float32 images.
 
-    Keys are `attributes`, the inputs of `effects`, what these derive from, and for each effect, and
-    each of `layers` (`references.layer_of`), `reference_<name>` and `reference_<name>_error`.
+    Keys are `attributes`, the inputs of `effects`, what these derive from, and for each effect
+    `reference_<name>` and `reference_<name>_error`.
     `samples` are per pixel; the same `seed` gives the same noise.
 
     Raises:
-        ConfigError: an effect has no reference, there is no such layer, or an attribute or effect
-            needs a setting of the view.
+        ConfigError: an effect has no reference, or an attribute or effect needs a setting of the
+            view.
         SceneError: the view moves an object that the scene doesn't have.
     """
-    references: dict[str, Any] = {effect: reference_of(effect) for effect in effects}
+    references = {effect: reference_of(effect) for effect in effects}
     names = {*attributes, *(name for effect in references for name in EFFECTS[effect].inputs)}
-    references |= {layer: layer_of(layer).render for layer in layers}
     hits = trace(scene, view.camera, width, height)
     images = make_attributes(scene, view, hits, names, seed=seed, samples=samples)
     for name, reference in references.items():
         value, error = reference(scene, view, hits, images, samples=samples, seed=seed)
         images[f"reference_{name}"] = value
-        if error is not None:
-            images[f"reference_{name}_error"] = error
+        images[f"reference_{name}_error"] = error
     return images
 
 
@@ -63,7 +60,6 @@ def render(
     *,
     effects: Sequence[str],
     attributes: Sequence[str] = tuple(ATTRIBUTES),
-    layers: Sequence[str] = (),
     samples: int,
     seed: int,
 ) -> dict[str, Any]:
@@ -84,7 +80,6 @@ def render(
         *size,
         effects=effects,
         attributes=asked,
-        layers=layers,
         samples=samples,
         seed=seed,
     )
@@ -98,9 +93,7 @@ def render(
     # Attributes in 16 bits where their units allow that; references keep 32.
     narrow = [a.channels for a in ATTRIBUTES.values() if a.unit.storage == "float16"]
     half = {channel for channels in narrow for channel in channels}
-    exr.write(
-        target, channels_of(images, attributes, effects, layers), attributes=header, half=half
-    )
+    exr.write(target, channels_of(images, attributes, effects), attributes=header, half=half)
     figures: dict[str, Any] = {
         "file": str(target),
         "size": list(size),
@@ -117,24 +110,14 @@ def render(
     return figures
 
 
-def channels_of(
-    images: Images, attributes: Iterable[str], effects: Iterable[str], layers: Iterable[str] = ()
-) -> Images:
-    """Canonical EXR channels, (H, W), of `attributes` and the references of `effects`.
-
-    Those of `layers` are numbered.
-    """
+def channels_of(images: Images, attributes: Iterable[str], effects: Iterable[str]) -> Images:
+    """Canonical EXR channels, (H, W), of `attributes` and the references of `effects`."""
     found: Images = {}
     for name in attributes:
         found |= dict(zip(ATTRIBUTES[name].channels, images[name], strict=True))
-    suffixes: dict[str, Sequence[str]] = {}
     for effect in effects:
         outputs = EFFECTS[effect].outputs
-        suffixes[effect] = ("V",) if len(outputs) == 1 else outputs
-    for layer in layers:
-        suffixes[layer] = [f"{index:02d}" for index in range(layer_of(layer).channels)]
-    for name, ends in suffixes.items():
-        for layer in (f"reference_{name}", f"reference_{name}_error"):
-            for end, plane in zip(ends, images.get(layer, ()), strict=layer in images):
-                found[f"{layer}.{end}"] = plane
+        ends = ("V",) if len(outputs) == 1 else outputs
+        for layer in (f"reference_{effect}", f"reference_{effect}_error"):
+            found |= {f"{layer}.{e}": plane for e, plane in zip(ends, images[layer], strict=True)}
     return found

@@ -14,14 +14,11 @@ from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.files import replacing
 from deepshade.manifest import Shard
-from deepshade_workers.references import layer_of
 from deepshade_workers.view import Images
 
 
-def schema(
-    effects: Sequence[str], size: int, layers: Sequence[str] = ()
-) -> dict[str, dict[str, Any]]:
-    """Tensors of a data set for `effects`: their inputs, references, errors, and more `layers`."""
+def schema(effects: Sequence[str], size: int) -> dict[str, dict[str, Any]]:
+    """Tensors of a data set for `effects`: their inputs, references and errors."""
     tensors: dict[str, dict[str, Any]] = {}
     for row in (EFFECTS[effect] for effect in effects):
         for attribute in (ATTRIBUTES[name] for name in row.inputs):
@@ -29,10 +26,6 @@ def schema(
             tensors[attribute.name] = {"dtype": attribute.unit.storage, "shape": shape}
         for name in (f"reference_{row.name}", f"reference_{row.name}_error"):
             tensors[name] = {"dtype": row.storage, "shape": [len(row.outputs), size, size]}
-    for name in layers:
-        layer = layer_of(name)
-        for full in (f"reference_{name}",) + (() if layer.exact else (f"reference_{name}_error",)):
-            tensors[full] = {"dtype": layer.storage, "shape": [layer.channels, size, size]}
     return tensors
 
 

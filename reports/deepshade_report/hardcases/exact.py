@@ -10,16 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-from deepshade.bundles import Bundle, bundle_folders
+from deepshade.bundles import Bundle
 from deepshade.engines import Backend, Engine
 from deepshade.engines.base import Float
-from deepshade.errors import DataError
-from deepshade_trainer.lookups import lens
 from deepshade_trainer.networks import from_bundle
-from deepshade_trainer.networks.reflections import Reflections
 
 FLOAT64 = Backend("pytorch", "float64")
 # Where the CPU has no 16 bits of its own: what they cost, though not what they spare.
@@ -35,7 +32,7 @@ class _Torch(Engine):
 
     def __init__(self, bundle: Bundle, backend: Backend) -> None:
         super().__init__(bundle, backend, threads=torch.get_num_threads())
-        self.shader = _shader(bundle)
+        self.shader = from_bundle(bundle.path)
         self._known: dict[bytes, Float] = {}
 
     def predict(self, gbuffer: Float, environment: Mapping[str, Float] | None = None) -> Float:
@@ -110,26 +107,3 @@ class _Stay64(TorchFunctionMode):
         if func is torch.Tensor.float:
             return args[0].double()
         return func(*args, **(kwargs or {}))
-
-
-def _shader(bundle: Bundle) -> nn.Module:
-    """What a bundle was exported from, in PyTorch. Raises DataError where a part of it is gone."""
-    network = bundle.network
-    if network.get("kind") == "reflections":
-        return Reflections(network["lobes"]).eval()
-    if network.get("kind") == "lens":
-        occlusion, blur = (_part(bundle, digest) for digest in network["of"])
-        return lens(occlusion, blur, network["lobes"])
-    return from_bundle(bundle.path)
-
-
-def _part(bundle: Bundle, digest: str) -> Bundle:
-    """The bundle beside this one whose graph has that hash."""
-    for folder in bundle_folders(bundle.path.parent.parent):
-        part = Bundle.load(folder)
-        if part.short_hash == digest:
-            return part
-    raise DataError(
-        f"{bundle.path} was made of a bundle {digest}, which isn't there",
-        fix="export it again from those that are (docs/training.md)",
-    )

@@ -53,7 +53,7 @@ def patches(effect: Effect, easy: Picture) -> Iterator[tuple[str, Picture]]:
 
 def rows(bundle: Bundle, easy: Picture) -> Iterator[Row]:
     """How far each precision's gradient is from float64's; nothing for what isn't trained."""
-    if "lobes" in bundle.network:  # tables, or a chain of bundles that are trained alone
+    if from_bundle(bundle.path).network.calculated:
         return
     effect = EFFECTS[bundle.effect]
     known: dict[str, Float] = {}

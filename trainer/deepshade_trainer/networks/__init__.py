@@ -15,10 +15,13 @@ from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade_trainer.networks.carrier import Carrier, CarrierConfig
 from deepshade_trainer.networks.chain import Chain, ChainConfig
+from deepshade_trainer.networks.discs import Discs, DiscsConfig
 from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet
+from deepshade_trainer.networks.lens import Lens, LensConfig
 from deepshade_trainer.networks.network import Network
 from deepshade_trainer.networks.openings import Openings, OpeningsConfig
 from deepshade_trainer.networks.paper_unet import PaperConfig, PaperUNet
+from deepshade_trainer.networks.reflections import Reflections, ReflectionsConfig
 from deepshade_trainer.networks.shader import Shader
 
 __all__ = [
@@ -28,18 +31,31 @@ __all__ = [
     "Shader",
     "build",
     "bundle_weights",
+    "check_learns",
     "from_bundle",
     "network_config",
 ]
 
-NetworkConfig = CarrierConfig | ChainConfig | FoldConfig | OpeningsConfig | PaperConfig
+NetworkConfig = (
+    CarrierConfig
+    | ChainConfig
+    | DiscsConfig
+    | FoldConfig
+    | LensConfig
+    | OpeningsConfig
+    | PaperConfig
+    | ReflectionsConfig
+)
 
 _KINDS: dict[str, tuple[Any, Any]] = {
     "carrier": (CarrierConfig, Carrier),
     "chain": (ChainConfig, Chain),
+    "discs": (DiscsConfig, Discs),
     "fold": (FoldConfig, FoldUNet),
+    "lens": (LensConfig, Lens),
     "openings": (OpeningsConfig, Openings),
     "paper": (PaperConfig, PaperUNet),
+    "reflections": (ReflectionsConfig, Reflections),
 }
 
 
@@ -50,6 +66,17 @@ def build(config: NetworkConfig) -> Network:
     """
     made: Network = _KINDS[config.kind][1](config)
     return made
+
+
+def check_learns(effect: str, kind: str | None) -> None:
+    """Raise ConfigError for a kind of network of which nothing is learnt."""
+    if kind in _KINDS and _KINDS[kind][1].calculated:
+        raise ConfigError(
+            effect,
+            detail=f"the shader of '{effect}' that ships is calculated: it has nothing to learn",
+            fix="use it as it is, train the paper's network instead (deepshade train "
+            f"{effect} --preset paper), or choose another effect",
+        )
 
 
 def network_config(settings: Mapping[str, Any], base: NetworkConfig | None = None) -> NetworkConfig:

@@ -25,7 +25,7 @@ class CarrierConfig:
     kind: str = "carrier"
     inputs: int = 4
     outputs: int = 3
-    bases: str = "discs"
+    bases: str = "neighbours"
     widths: tuple[int, ...] = (48, 96, 128)
     steps: tuple[int, ...] = (4, 2)
     down: tuple[int, ...] = (1, 2, 2)

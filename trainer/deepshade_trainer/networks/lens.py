@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from deepshade.tensors import channel_slices
-from deepshade_trainer.networks.bases.discs import Discs
-from deepshade_trainer.networks.carrier import Carrier
-from deepshade_trainer.networks.fold_unet import FoldUNet, full_precision
+from deepshade_trainer.networks.discs import Discs
+from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
 from deepshade_trainer.networks.horizons import covered
-from deepshade_trainer.networks.receptive_field import Span, halo, joined
+from deepshade_trainer.networks.network import Network
+from deepshade_trainer.networks.receptive_field import Span, joined
 from deepshade_trainer.networks.reflections import ATTRIBUTES as SURFACE
 from deepshade_trainer.networks.reflections import Reflections
 
@@ -19,54 +20,57 @@ from deepshade_trainer.networks.reflections import Reflections
 ATTRIBUTES = (*SURFACE, "normal", "position", "focal")
 
 
-class Lens(nn.Module):
+@dataclass(frozen=True)
+class LensConfig:
+    """The shape of what occludes, and the short hash of the bundle that its weights are `of`."""
+
+    kind: str = "lens"
+    inputs: int = 20
+    outputs: int = 3
+    occlusion: FoldConfig = field(default_factory=FoldConfig)
+    of: str = ""
+
+
+class Lens(Network):
     """A G-buffer (`ATTRIBUTES`), an environment's table and a turn to radiance through a thin lens.
 
-    The light of `reflections`, weighted by `occlusion` (of normals and positions, 1 is open) where
-    there is a surface, is blurred by `blur`, a `Carrier` of `Discs`. Both trunks see geometry
-    alone, so that the answer is linear in the environment.
+    The light of `Reflections`, weighted by `occlusion` (of normals and positions, 1 is open) where
+    there is a surface, is blurred by `Discs`. What occludes sees geometry alone, so that the
+    answer is linear in the environment.
     """
 
-    rounded = ("occlusion.", "blur.trunk.")
+    linear = True
+    rounded = "occlusion."
+    calculated = True
+    environment = Reflections.environment
 
-    def __init__(self, reflections: Reflections, occlusion: FoldUNet, blur: Carrier) -> None:
+    def __init__(self, config: LensConfig) -> None:
         super().__init__()
-        self.reflections, self.occlusion, self.blur = reflections, occlusion, blur
-        assert isinstance(blur.bases, Discs)
-        self.discs: Discs = blur.bases
+        self.reflections, self.discs = Reflections(), Discs()
+        self.occlusion = FoldUNet(config.occlusion)
         self.places = channel_slices(ATTRIBUTES, False)
 
     @property
     def size_multiple(self) -> int:
         """What all parts need."""
-        return math.lcm(self.occlusion.size_multiple, self.blur.size_multiple)
-
-    @property
-    def halo(self) -> int:
-        """See `Network.halo`."""
-        return halo(self.receptive_field, self.size_multiple)
+        return math.lcm(self.occlusion.size_multiple, self.discs.size_multiple)
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`: the blur's own, and what dims the light it spreads."""
         first, last = self.discs.receptive_field(pixel)
         dimmed = self.occlusion.receptive_field(first)[0], self.occlusion.receptive_field(last)[1]
-        return joined(self.blur.receptive_field(pixel), dimmed)
+        return joined((first, last), dimmed)
 
-    def forward(self, gbuffer: Tensor, table: Tensor, turn: Tensor) -> Tensor:
+    def forward(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
         """(1, 20, H, W), (1, 3, HEIGHT, WIDTH) and (3, 3) to radiance (1, 3, H, W)."""
         position, focal = self.places["position"], self.places["focal"]
         openness = self.occlusion(gbuffer, self.places["normal"].start)
         with full_precision():
             surface = covered(gbuffer[:, position.stop - 1 : position.stop])
             openness = ((openness - 1) * surface + 1).clamp(0, 1)
-            light = self.reflections(gbuffer, table, turn) * openness
-            told, state = self.discs.spread(gbuffer[:, focal], light)
-        weights = self.blur.trunk(told)
-        with full_precision():
-            seen: Tensor = self.discs.carry(state, weights.float()).clamp_min(0)
-            return seen
+            light = self.reflections(gbuffer, *given) * openness
+            return self.discs.spread(gbuffer[:, focal], light)
 
     def prepare_export(self) -> None:
         """See `Network.prepare_export`."""
         self.occlusion.prepare_export()
-        self.blur.prepare_export()

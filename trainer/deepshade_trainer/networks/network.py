@@ -25,8 +25,10 @@ class Network(nn.Module, ABC):
     # Whether light passes linearly, three colours at once: then no curve stands before or after.
     linear = False
     # Convolutions may be calculated in 16 and 8 bits where their weights' names begin so. If only
-    # some may, all that doesn't lie between those is calculated in float32.
-    rounded = ""
+    # some may, all that doesn't lie between those is calculated in float32. None: none may.
+    rounded: str | None = ""
+    # Whether nothing of it is learnt, but for what it takes over, frozen, from another network.
+    calculated = False
     # What it is given of an environment beside the G-buffer: names in `environments.INPUTS`.
     environment: tuple[str, ...] = ()
 

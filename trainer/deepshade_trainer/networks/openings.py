@@ -1,26 +1,26 @@
-"""Our network for light from all around: geometry decides what is blocked in each direction."""
+"""Light from all around: geometry decides what is blocked in each direction."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
-from deepshade.errors import ConfigError
+from deepshade.tensors import channel_slices
 from deepshade_trainer.networks import slices
 from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
 from deepshade_trainer.networks.horizons import covered, unit
-from deepshade_trainer.networks.network import Network, check_types, constant
+from deepshade_trainer.networks.network import Network, constant
 from deepshade_trainer.networks.receptive_field import Span, folded, grown, joined
 from deepshade_trainer.networks.reflections import blurred, mean, turned
 
-LEVEL = 5  # the map is seen through lobes of exponent 2^LEVEL
+# what a graph takes, in this order
+ATTRIBUTES = ("normal_world", "normal", "position")
+_LEVEL = 5  # the map is seen through lobes of exponent 2^LEVEL
 _SURFACE = 0.25  # the square of a normal's length; background has none
 _APART = 0.025  # distances from a pixel's plane at which a cell no longer tells of it, over depth
 _SMOOTHED = 0.15  # effect radii from which on cells don't lend each other what is blocked
@@ -31,30 +31,13 @@ _LEAST = 0.02  # of that which is blocked, to be multiplied
 
 @dataclass(frozen=True)
 class OpeningsConfig:
-    """The shape of the trunk, which is that of ambient occlusion, and of what looks at slices.
-
-    `hidden` are the channels between its layers. `world` and `normal` are the first of the three
-    channels of the normal, in world space and in camera space; positions follow the latter.
-    """
+    """The shape of the trunk, and the short hash of the bundle that its weights are `of`."""
 
     kind: str = "openings"
     inputs: int = 9
     outputs: int = 3
-    trunk: FoldConfig = field(default_factory=lambda: FoldConfig(normal=0, position=3, bias=0.85))
-    hidden: int = 24
-    world: int = 0
-    normal: int = 3
-    position: int = 6
-
-    def __post_init__(self) -> None:
-        """Raise ConfigError where entries don't fit each other."""
-        check_types(self)
-        if self.hidden < 1:
-            raise ConfigError("hidden", detail="hidden must be 1 or more")
-        if self.trunk.fold != slices.CELL:
-            raise ConfigError("fold", detail="the trunk's fold must be 4")
-        if (self.trunk.normal, self.trunk.position) != (0, 3) or self.normal + 3 != self.position:
-            raise ConfigError("position", detail="positions must follow normals")
+    trunk: FoldConfig = field(default_factory=FoldConfig)
+    of: str = ""
 
 
 class Openings(Network):
@@ -65,20 +48,19 @@ class Openings(Network):
         B = Σ_k c_k Ω/π N·ω_k E_k
 
     is blocked: ω_k are the sectors of the slices through a cell (`slices`), Ω their solid angle,
-    E_k the map through a lobe about ω_k. How much of each is blocked, c_k, is calculated, and a
-    small network corrects it that sees one slice and what the trunk knows of the cell. A pixel has
-    B from the cells around it that lie in its plane; and W, the same of a white map. The trunk says
-    how much light is left under a white one, `ao`: an estimate as good as 1 - W, with errors of
-    its own. The answer has a weighted geometric mean of both:
+    E_k the map through a lobe about ω_k, c_k how much of each is blocked. A pixel has B from the
+    cells around it that lie in its plane; and W, the same of a white map. The trunk, that of
+    ambient occlusion, says how much light is left under a white one, `ao`: an estimate as good as
+    1 - W, with errors of its own. The answer has a weighted geometric mean of both:
 
         I - B ((1 - ao) / W)^t
 
-    It is linear in the map. Where there is no surface stands the map's mean. The trunk is that of
-    `ao` and stays as it was trained there.
+    It is linear in the map. Where there is no surface stands the map's mean.
     """
 
     linear = True
     rounded = "trunk."
+    calculated = True
     environment = ("lobes", "turn", "camera")
     towards: Tensor
     fit: Tensor
@@ -86,15 +68,8 @@ class Openings(Network):
 
     def __init__(self, config: OpeningsConfig) -> None:
         super().__init__()
-        self.config = config
         self.trunk = FoldUNet(config.trunk)
-        hidden = config.hidden
-        self.see = nn.Conv2d(slices.HEIGHTS + 2, hidden, 3, padding=1)
-        self.know = nn.ModuleList(
-            nn.Conv2d(config.trunk.widths[0], hidden, 1, bias=False) for _ in range(slices.AZIMUTHS)
-        )
-        self.block = nn.Conv2d(hidden, slices.HEIGHTS, 1, bias=False)
-        nn.init.zeros_(self.block.weight)
+        self.places = channel_slices(ATTRIBUTES, False)
         toward, fit = slices.nodes()
         for name, value in (
             ("towards", toward.reshape(1, -1, 3).transpose(0, 2, 1)[..., None]),
@@ -107,65 +82,38 @@ class Openings(Network):
     @property
     def size_multiple(self) -> int:
         """See `Network.size_multiple`."""
-        return self.trunk.size_multiple
+        return math.lcm(self.trunk.size_multiple, slices.CELL)
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
         cell = pixel // slices.CELL
-        # of the cells around a pixel, those around them, and what these convolve with
-        seen = folded(grown((cell, cell), 3 + slices.REACH), slices.CELL)
-        # its pixels depend on the cells around theirs
-        spans = (self.trunk.receptive_field((cell + k) * slices.CELL) for k in (-1, 0, 1))
-        return reduce(joined, spans, joined(seen, self.trunk.receptive_field(pixel)))
+        seen = folded(grown((cell, cell), 2 + slices.REACH), slices.CELL)  # by the cells around
+        return joined(seen, self.trunk.receptive_field(pixel))
 
     def forward(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
         """(1, 9, H, W), the table of `environments.lobes`, the turns from world and from camera to
         the map (3, 3), to (1, 3, H, W)."""
         lobes, turn, camera = given
+        first, last = self.places["normal"].start, self.places["position"].stop
+        occlusion = self.trunk(gbuffer, first).clamp(0, 1)
         with full_precision():
-            start = self.config.world
-            normal = gbuffer[:, start : start + 3]
-            seen = blurred(lobes, turned(normal, turn), 0)
-            around = mean(lobes)
-            surface = (normal * normal).sum(1, keepdim=True) > _SURFACE
-            surface = surface & (self._covered(gbuffer) > 0)
-            irradiance = torch.where(surface, seen, around)
-            through = blurred(lobes, turned(self.towards, camera), LEVEL)
+            covers = covered(gbuffer[:, last - 1 : last])
+            normal = gbuffer[:, self.places["normal_world"]]
+            surface = ((normal * normal).sum(1, keepdim=True) > _SURFACE) & (covers > 0)
+            irradiance = blurred(lobes, turned(normal, turn), 0)
+            irradiance = torch.where(surface, irradiance, mean(lobes))
+            through = blurred(lobes, turned(self.towards, camera), _LEVEL)
             through = self.fit @ through.reshape(1, 3, -1, slices.SECTORS)
-        return self.lit(gbuffer, irradiance, through)
-
-    def lit(self, gbuffer: Tensor, irradiance: Tensor, through: Tensor) -> Tensor:
-        """(N, C, H, W) for a G-buffer under C / 3 maps at once.
-
-        `irradiance` (N, C, H, W) is that of the open surface, over π, and of background the map's
-        mean; `through` (N, C, TERMS, SECTORS) are E_k as polynomials (`slices.lobes`).
-        """
-        with torch.no_grad():
-            cells = self.trunk.cells(gbuffer, self.config.normal)
-            occlusion = self.trunk.pixels(cells).clamp(0, 1)
-        with full_precision():
-            first = self.config.normal
-            folded = F.pixel_unshuffle(gbuffer[:, first : first + 6], slices.CELL)
-            folded = folded.reshape(len(folded), 6, slices.CELL**2, *folded.shape[2:])
-            at = folded[:, :, slices.TAKEN * (slices.CELL + 1)]
+            pixels = F.pixel_unshuffle(gbuffer[:, first:last], slices.CELL)
+            pixels = pixels.reshape(len(pixels), 6, slices.CELL**2, *pixels.shape[2:])
+            at = pixels[:, :, slices.TAKEN * (slices.CELL + 1)]
             at = torch.cat([unit(at[:, :3]), at[:, 3:], covered(at[:, 5:])], 1)
-            with torch.no_grad():
-                seen = slices.slices(folded, at)
-        blocked = self._blocked(seen, cells).float()
-        with full_precision():
-            vectors = _smoothed(at, self._gathered(at, blocked, through))  # (N, 3, C + 1, h, w)
-            less = _at_pixels(folded, at, vectors)
+            blocked = torch.cat(slices.slices(pixels, at), 1)  # (1, SECTORS, h, w)
+            vectors = _smoothed(at, self._gathered(at, blocked, through))  # (1, 3, 4, h, w)
+            less = _at_pixels(pixels, at, vectors)
             less, white = less[:, :-1], less[:, -1:]
             ratio = ((1 - occlusion) / white.clamp_min(_LEAST)).clamp(_LEAST**2, _MOST)
-            return irradiance - less * ratio**_TRUST * self._covered(gbuffer)
-
-    def _blocked(self, seen: Sequence[Tensor], cells: Tensor) -> Tensor:
-        """What of each sector is blocked, (N, SECTORS, h, w)."""
-        found = []
-        for one, know in zip(seen, self.know, strict=True):
-            learnt = self.block(F.relu(self.see(one) + know(cells)))
-            found.append(one[:, : slices.HEIGHTS] + learnt)
-        return torch.cat(found, 1)
+            return irradiance - less * ratio**_TRUST * covers
 
     def _gathered(self, at: Tensor, blocked: Tensor, through: Tensor) -> Tensor:
         """Σ_k c_k Ω_k/π ω_k E_k in camera space, (N, 3, C + 1, h, w); the last for a white map."""
@@ -179,10 +127,6 @@ class Openings(Network):
         white = (self.cosines @ flat).reshape(count, 3, 1, high, wide)
         vectors = torch.cat([light, white], 2) * at[:, None, 6:]
         return slices.out_of_frame(eye[:, :, None], vectors)
-
-    def _covered(self, gbuffer: Tensor) -> Tensor:
-        last = self.config.position + 2
-        return covered(gbuffer[:, last : last + 1])
 
     def prepare_export(self) -> None:
         """See `Network.prepare_export`."""

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from deepshade.environments.lobes import HEIGHT, LEVELS, TILES, WIDTH
 from deepshade.tensors import channel_slices
 from deepshade_trainer.networks import phong
+from deepshade_trainer.networks.network import Network
+from deepshade_trainer.networks.receptive_field import Span
 
 # atan(x) / x in powers of x², for |x| <= 1: a least-squares fit, within 2e-6
 _ATAN = np.polynomial.polynomial.polyfit(
@@ -26,7 +29,17 @@ _SHARP = len(TILES) - 1  # the tile of the map itself
 Number = Tensor | int
 
 
-class Reflections(nn.Module):
+@dataclass(frozen=True)
+class ReflectionsConfig:
+    """How many lobes, 1 or 2, Phong's is replaced by."""
+
+    kind: str = "reflections"
+    inputs: int = 13
+    outputs: int = 3
+    lobes: int = 1
+
+
+class Reflections(Network):
     """A G-buffer (`ATTRIBUTES`), an environment's table and a turn to radiance,
     R_diff A(N, 1) + R_spec ∫ K L dω.
 
@@ -34,26 +47,34 @@ class Reflections(nn.Module):
     surface stands the environment behind it; where the view isn't known there, its mean.
     """
 
-    rounded = ()  # see `Network`: nothing may be
+    linear = True
+    rounded = None
+    calculated = True
+    environment = ("lobes", "turn")
     size_multiple = 1
-    halo = 0
 
     fits: Tensor
     row: Tensor
     column: Tensor
     rows: Tensor
 
-    def __init__(self, lobes: int = 1) -> None:
+    def __init__(self, config: ReflectionsConfig | None = None) -> None:
         super().__init__()
-        self.lobes = lobes
+        self.lobes = lobes = config.lobes if config else 1
         self.places = channel_slices(ATTRIBUTES, False)
-        self.register_buffer("fits", torch.from_numpy(phong.table(lobes))[None])
+        self.register_buffer("fits", torch.from_numpy(phong.table(lobes))[None], persistent=False)
         corners = np.array([(tile.row, tile.column, tile.rows) for tile in TILES], np.float32)
         for name, column in zip(("row", "column", "rows"), corners.T, strict=True):
-            self.register_buffer(name, torch.from_numpy(column.copy()))
+            self.register_buffer(name, torch.from_numpy(column.copy()), persistent=False)
 
-    def forward(self, gbuffer: Tensor, table: Tensor, turn: Tensor) -> Tensor:
-        """(1, 13, H, W), (1, 3, HEIGHT, WIDTH) and (3, 3) to radiance (1, 3, H, W)."""
+    def receptive_field(self, pixel: int) -> Span:
+        """See `Network.receptive_field`."""
+        return pixel, pixel
+
+    def forward(self, gbuffer: Tensor, *given: Tensor) -> Tensor:
+        """(1, 13, H, W), a table (1, 3, HEIGHT, WIDTH) and a turn (3, 3) to radiance
+        (1, 3, H, W)."""
+        table, turn = given
         normal, view, diffuse, specular, gloss = (gbuffer[:, at] for at in self.places.values())
         square = _dot(normal, normal)
         surface = square > _SURFACE
@@ -80,9 +101,6 @@ class Reflections(nn.Module):
         shine = torch.where(surface, specular, 1) * (share.clamp_min(0) * seen)
         spread = blurred(table, normal, 0)
         return diffuse * spread + shine
-
-    def prepare_export(self) -> None:
-        """See `Network.prepare_export`."""
 
     def _fit(self, mu: Tensor, gloss: Tensor) -> Tensor:
         """(1, 4 or 5, H, W): see `phong.table`."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -15,7 +13,6 @@ from deepshade.errors import ConfigError
 from deepshade.tensors import channel_slices
 from deepshade_trainer.networks.horizons import covered
 from deepshade_trainer.networks.network import Network
-from deepshade_trainer.networks.openings import Openings
 
 _BLACK = 1e-30  # of radiance
 
@@ -98,13 +95,6 @@ class Shader(nn.Module):
         if self.background is None:
             return image
         return (image - self.background) * self._coverage(gbuffer) + self.background
-
-    def lit(self, gbuffer: Tensor, irradiance: Tensor, through: Tensor) -> Tensor:
-        """As `on_curve` (N J, 3, H, W), under J maps at once: see `Openings.lit`."""
-        (height, width), (rows, columns) = gbuffer.shape[2:], irradiance.shape[2:]
-        irradiance = F.pad(irradiance, (0, width - columns, 0, height - rows), "replicate")
-        image = cast(Openings, self.network).lit(gbuffer, irradiance, through)
-        return image.reshape(-1, 3, *image.shape[2:])
 
     def curve(self, image: Tensor) -> Tensor:
         """Light or answers through the transfer curve."""

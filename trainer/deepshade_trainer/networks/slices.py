@@ -67,12 +67,11 @@ def out_of_frame(eye: Tensor, vectors: Tensor) -> Tensor:
 
 
 def slices(folded: Tensor, at: Tensor) -> list[Tensor]:
-    """What each cell sees of each slice: AZIMUTHS of (N, HEIGHTS + 2, h, w).
+    """How much of the sectors of each slice each cell sees blocked: AZIMUTHS of (N, HEIGHTS, h, w).
 
     `folded` (N, 6, 16, h, w) are normals and positions, in effect radii, of the pixels of each
     cell; `at` (N, 7, h, w) those of the one taken, its normal of length 1, and 1 where there is
-    geometry. The blocked parts of the sectors, from the eye's ray on, are 0 below the surface's
-    horizon; then come the normal's parts towards the eye and along the slice.
+    geometry. Sectors come from the eye's ray on; below the surface's horizon they are 0.
     """
     # nothing is near what is far behind the camera: neither background nor the picture's edge
     across, depth = torch.split(folded[:, 3:], [2, 1], 1)
@@ -104,7 +103,7 @@ def slices(folded: Tensor, at: Tensor) -> list[Tensor]:
             over = along * math.sqrt(1 - height * height) + facing * height
             above = (over * 4 + 0.5).clamp(0, 1)
             parts.append((most * (HEIGHTS / 2)).clamp(0, 1) * above)
-        found.append(torch.cat([*parts, facing, along], 1))
+        found.append(torch.cat(parts, 1))
     return found
 
 
@@ -159,12 +158,3 @@ def _powers(at: Tensor) -> Tensor:
     for _ in range(_DEGREE):
         rows.append([rows[-1][0] * x, *(term * y for term in rows[-1])])
     return torch.cat([term for row in rows for term in row], 1)
-
-
-def lobes(lamps: Float64, exponent: float) -> NDArray[np.float32]:
-    """(TERMS, SECTORS, L): what lamps in camera space (L, 3) give to the polynomials' coefficients,
-    each sector seeing light through a lobe about it."""
-    toward, fit = nodes()
-    shares = np.maximum(toward @ lamps.T, 0) ** exponent
-    shares /= shares.sum(2, keepdims=True)
-    return np.tensordot(fit, shares, 1).astype(np.float32)

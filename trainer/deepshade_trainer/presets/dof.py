@@ -3,14 +3,6 @@
 from deepshade_trainer.presets.paper import paper
 
 PRESETS = {
-    "balanced": {
-        "network": {
-            "kind": "carrier",
-            "bases": "discs",
-            "widths": (24, 32, 48),
-            "steps": (2, 2),
-            "up": (1, 1),
-        }
-    },
+    "balanced": {"network": {"kind": "discs"}},
     **paper({"kind": "paper", "u0": 8, "levels": 5}),
 }

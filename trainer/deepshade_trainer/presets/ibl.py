@@ -1,8 +1,8 @@
-"""Image-based lighting: what ships looks its answer up instead (`deepshade_trainer.lookups`)."""
+"""Image-based lighting."""
 
 from deepshade_trainer.presets.paper import paper
 
 PRESETS = {
-    "balanced": {},
+    "balanced": {"network": {"kind": "reflections"}},
     **paper({"kind": "chain", "widths": (300,), "kernel": 1, "groups": 3}, batch=5),
 }

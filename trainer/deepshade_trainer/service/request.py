@@ -9,11 +9,12 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from deepshade.bundles import CONFIG, check_name
+from deepshade.bundles import CONFIG, Bundle, check_name
 from deepshade.effects import EFFECTS
 from deepshade.errors import BundleError, ConfigError, nearest
 from deepshade.manifest import NAME
 from deepshade.versions import Alias
+from deepshade_trainer.networks import check_learns
 from deepshade_trainer.service.config import REHEARSAL, TEST, Settings
 from deepshade_trainer.service.places import confined
 from deepshade_trainer.service.store import QUEUED, Job
@@ -80,6 +81,7 @@ def job_of(
     if effect not in EFFECTS:
         raise ConfigError(effect, EFFECTS, detail=f"no effect is called {effect[:100]!r}")
     base = find_base(effect, asked.base, settings)
+    check_learns(effect, Bundle.load(base).network.get("kind"))
     name = asked.name or asked.base
     Alias(settings.published, effect, name)  # may it be called so?
     rendering = _rendering(effect, asked, settings)

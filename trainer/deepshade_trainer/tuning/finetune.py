@@ -28,9 +28,7 @@ from deepshade_trainer import card
 from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.evaluation import evaluate
 from deepshade_trainer.export import export
-from deepshade_trainer.lit import Lit
 from deepshade_trainer.networks import Shader, build, bundle_weights
-from deepshade_trainer.networks.openings import Openings
 from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run, Tensors
 from deepshade_trainer.training import train
@@ -115,17 +113,15 @@ def base_recipe(plan: Plan) -> Recipe:
     """How it is trained: as the preset of the base's name, or the balanced one, but gently."""
     base = Bundle.load(Path(plan.base))
     known = import_module(f"deepshade_trainer.presets.{plan.effect}").PRESETS
-    found = preset(base.name if base.name in known else "balanced", plan.effect)
-    changes: dict[str, Any] = {
-        "lr": plan.lr or RATE,
-        "ema": EMA,
-        "batch": plan.batch or found.batch,
-        "seed": plan.seed,
-        "init_from": plan.base,
-    }
-    if base.network:
-        changes["network"] = base.network
-    return found.changed(**changes)
+    name = base.name if base.name in known else "balanced"
+    found = preset(name, plan.effect, base.network)
+    return found.changed(
+        lr=plan.lr or RATE,
+        ema=EMA,
+        batch=plan.batch or found.batch,
+        seed=plan.seed,
+        init_from=plan.base,
+    )
 
 
 def _pilot(plan: Plan, recipe: Recipe) -> float:
@@ -156,15 +152,7 @@ def _blend(plan: Plan, recipe: Recipe, run: Run, parts: Parts, folder: Path) -> 
     tuned = run.load()[0]["average"]
     start = {**tuned, **bundle_weights(Bundle.load(Path(plan.base)))}
     start = {name: start[name] for name in tuned}
-    data: Dataset
-    if isinstance(build(recipe.network), Openings):  # which is judged by what is open, as it learns
-        if not parts.reminders:
-            raise DataError(
-                f"fine-tuning {plan.effect} needs older views to rehearse",
-                fix="give the trainer a library with rehearsal views: see docs/trainer.md",
-            )
-        data, numbers = Lit(folders_of(plan), plan.effect), parts.reminders
-    elif parts.reminders:
+    if parts.reminders:
         data, numbers = dataset_of(plan), parts.reminders
     else:
         folders = [path for group in _tests(plan, folder).values() for path in group]

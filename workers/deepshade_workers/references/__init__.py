@@ -6,15 +6,11 @@
 settings, `hits` (`trace.Hits`) what each pixel's centre sees, and `images` the attributes that
 were made of them, at least the effect's inputs. `samples` are per pixel; the same `seed` gives the
 same noise. Both results are planar (C, H, W) float32 with the effect's outputs as channels.
-
-A file may also define `LAYERS`: what networks may learn from beside the reference, made on request.
-Each is a `Layer` by its name; the whole is asked for as `<effect>_<name>`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from importlib import import_module
 from pkgutil import iter_modules
 
@@ -22,19 +18,6 @@ from deepshade.errors import ConfigError
 from deepshade_workers.view import Image
 
 Reference = Callable[..., tuple[Image, Image]]
-
-
-@dataclass(frozen=True)
-class Layer:
-    """What may be rendered beside a reference: a function like one, and what it gives.
-
-    `storage` is the type that holds the (channels, H, W) in a shard. What is exact has no error.
-    """
-
-    channels: int
-    render: Callable[..., tuple[Image, Image | None]]
-    storage: str = "float16"
-    exact: bool = False
 
 
 def known() -> tuple[str, ...]:
@@ -50,21 +33,6 @@ def require(effects: Iterable[str]) -> None:
             raise ConfigError(
                 effect, there, detail=f"no reference for {effect!r}; there are: {', '.join(there)}"
             )
-
-
-def layers_of(effect: str) -> dict[str, Layer]:
-    """What may be asked for beside the reference of `effect`, by full name."""
-    module = import_module(f"{__name__}.{effect}")
-    found: dict[str, Layer] = getattr(module, "LAYERS", {})
-    return {f"{effect}_{name}": layer for name, layer in found.items()}
-
-
-def layer_of(name: str) -> Layer:
-    """The layer `name`; ConfigError if no effect has it."""
-    there = {full: layer for effect in known() for full, layer in layers_of(effect).items()}
-    if name not in there:
-        raise ConfigError(name, there, detail=f"no layer {name!r}; there are: {', '.join(there)}")
-    return there[name]
 
 
 def reference_of(effect: str) -> Reference:

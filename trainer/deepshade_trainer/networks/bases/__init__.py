@@ -7,14 +7,12 @@ that a network predicts (`carrier.Carrier`).
 from deepshade_trainer.networks.bases.base import Bases
 from deepshade_trainer.networks.bases.bounces import Bounces
 from deepshade_trainer.networks.bases.diffusion import Diffusion
-from deepshade_trainer.networks.bases.discs import Discs
 from deepshade_trainer.networks.bases.lines import Lines
 from deepshade_trainer.networks.bases.neighbours import Neighbours
 
 BASES: dict[str, type[Bases]] = {
     "bounces": Bounces,
     "diffusion": Diffusion,
-    "discs": Discs,
     "lines": Lines,
     "neighbours": Neighbours,
 }

@@ -1,14 +1,16 @@
-"""Light spread over discs of a few sizes: what blur circles are blended from."""
+"""Light spread over discs of a few sizes, by the blur circle of each pixel: all is calculated."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from deepshade_trainer.networks.bases.base import Bases, State
+from deepshade_trainer.networks.fold_unet import full_precision
+from deepshade_trainer.networks.network import Network
 from deepshade_trainer.networks.receptive_field import Span, doubled, folded, grown, joined
 
 # Radii of blur in pixels: what lies between two of them is shared out to both. Below the first
@@ -20,30 +22,36 @@ _SOFT, _SOFTER = 16 / 3, 24.0
 _HIDDEN = 10.0  # over about which radius what a near surface hides is continued
 _FAINT = 1e-4  # how much a sharp pixel counts in the blurred picture, so that it has no holes
 _CLOSED = 1e-6  # how much shows through what covers all, so that nothing divides by 0
-_SURE = 4.0  # weights end at e^±4
 
 
-class Discs(Bases):
+@dataclass(frozen=True)
+class DiscsConfig:
+    """There is nothing to choose."""
+
+    kind: str = "discs"
+    inputs: int = 4
+    outputs: int = 3
+
+
+class Discs(Network):
     """Layers by the size of the blur circle and by side of the focus; input: focal (1), light (3).
 
     Each pixel is scattered over discs about its own circle's size, near and far side apart, with
-    the share of the lens that it covers. The classical answer lays the near side over what is
-    in focus and that over the far side (layered depth of field: Scofield, "2½-D Depth-of-Field
+    the share of the lens that it covers. The answer lays the near side over what is in focus and
+    that over the far side (layered depth of field: Scofield, "2½-D Depth-of-Field
     Simulation for Computer Animation", 1992; near and far fields: Jimenez, "Next Generation Post
     Processing in Call of Duty: Advanced Warfare", 2014), each by its coverage. What a near surface
-    hides from the pinhole and shows through its edge is continued from around. Three weights
-    change how much the near side, the far side and what is continued count.
+    hides from the pinhole and shows through its edge is continued from around.
 
     What is blurred is composited at half resolution and enlarged once. Its eight channels are
     coverage and premultiplied light of the near side, then of the far side: engines keep eight
     together, and fixed convolutions put values where they are needed sooner than splits would.
     """
 
-    told = 6
-    weights = 3
+    linear = True
+    rounded = None
+    calculated = True
     size_multiple = 4
-    cell = 2
-    reach = 1
 
     sides: Tensor
     least: Tensor
@@ -58,7 +66,7 @@ class Discs(Bases):
     far: Tensor
     hidden: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, config: DiscsConfig | None = None) -> None:
         super().__init__()
         side = torch.eye(2).repeat_interleave(4, 0)  # (8, 2): which side a channel is of
         coverage = torch.tensor([1.0, 0, 0, 0]).repeat(2)  # (8,)
@@ -83,12 +91,13 @@ class Discs(Bases):
         for name, kernel in kernels.items():
             self.register_buffer(name, kernel, persistent=False)
 
-    def features(self, gbuffer: Tensor) -> tuple[Tensor, State]:
-        """See `Bases.features`."""
-        return self.spread(gbuffer[:, :1], gbuffer[:, 1:])
+    def forward(self, gbuffer: Tensor) -> Tensor:
+        """See `Network.forward`."""
+        with full_precision():
+            return self.spread(gbuffer[:, :1], gbuffer[:, 1:])
 
-    def spread(self, focal: Tensor, light: Tensor) -> tuple[Tensor, State]:
-        """`features` of blur circles (N, 1, H, W) and light (N, 3, H, W)."""
+    def spread(self, focal: Tensor, light: Tensor) -> Tensor:
+        """The answer (N, 3, H, W) to blur circles (N, 1, H, W) and light (N, 3, H, W)."""
         # (N, 1, 2, H, W), before and behind the focus: engines would pad 2 channels to 8
         radius = F.relu(focal[:, None] * self.sides[:, None])
         share = (radius / _RADII[0]).clamp(max=1) + self.least[:, None]
@@ -133,16 +142,9 @@ class Discs(Bases):
         hidden = _twice(_spread(F.avg_pool2d(other, 2)[:, :4], self.hidden))
         seen = wide[:, :1] * (1 - layers[:, 4:5]).clamp_min(0)
         hidden = hidden * (seen / hidden[:, :1].clamp_min(1e-6))
-        told = torch.cat([layers[:, ::4], cover[:, ::4], reach[:, ::4] / _RADII[-1]], 1)
-        return told.clamp(max=2), (light, blurred, layers, hidden)
-
-    def carry(self, state: State, weights: Tensor) -> Tensor:
-        """See `Bases.carry`."""
-        light, blurred, layers, hidden = state
-        gains = torch.split(torch.exp(torch.tanh(weights / _SURE) * _SURE), 1, 1)
         near, far = torch.split(layers, 4, 1)
         left = 1 - near[:, :1].clamp(max=1)
-        total = near * gains[0] + far * (left * gains[1]) + hidden * (left * gains[2])
+        total = near + (far + hidden) * left
         left, total, colour = torch.split(_twice(torch.cat([left, total], 1)), [1, 1, 3], 1)
         # nowhere 0: where nothing else is, there is what is faint
         sharp = (1 - blurred).clamp_min(0) * left
