@@ -13,7 +13,7 @@ from deepshade.effects import EFFECTS
 from deepshade.environments import Environment, directions, read_environment, sky
 from deepshade.errors import ConfigError
 from deepshade_service.config import Settings
-from deepshade_trainer.lookups import export_reflections, picture
+from deepshade_trainer.calculated import export_calculated, picture
 
 from .conftest import encode
 
@@ -25,10 +25,10 @@ def as_exr(environment):
 
 
 @pytest.fixture(scope="module")
-def lookups(tmp_path_factory):
+def calculated(tmp_path_factory):
     """A models folder with `ibl`."""
-    root = tmp_path_factory.mktemp("lookups")
-    export_reflections(root / "ibl" / "balanced", lobes=1)
+    root = tmp_path_factory.mktemp("calculated")
+    export_calculated(root / "ibl" / "balanced", "reflections")
     return root
 
 
@@ -44,8 +44,8 @@ def maps(tmp_path):
 
 
 @pytest.fixture
-def lit(start, lookups, maps):
-    return start(models=lookups, environments=maps, environment_uploads=True)
+def lit(start, calculated, maps):
+    return start(models=calculated, environments=maps, environment_uploads=True)
 
 
 def ball(inputs=EFFECTS["ibl"].inputs, side=40, **attributes):
@@ -80,8 +80,8 @@ def test_each_request_has_its_own_environment(lit, maps):
 
 
 @pytest.mark.slow
-def test_the_generated_sky_is_there_without_a_folder(start, lookups):
-    local = start(models=lookups)
+def test_the_generated_sky_is_there_without_a_folder(start, calculated):
+    local = start(models=calculated)
     (entry,) = local.client.get("/environments").json()
     assert (entry["name"], entry["source"], entry["sha256"]) == ("sky", "generated", None)
     response = shade(local)
@@ -101,7 +101,7 @@ def test_a_turned_map_is_seen_behind_the_ball(lit, maps):
         ({"up": "z"}, lambda d: (d[0], d[2], -d[1])),
     ):
         found = pixels(shade(lit, environment="noon", half="false", **query))[:, 0, 0]
-        ray = -picture(40)[0, 3:6, 0, 0]
+        ray = -picture(40, EFFECTS["ibl"].inputs)[0, 3:6, 0, 0]
         np.testing.assert_allclose(found, environment.sample(np.array(towards(ray))), rtol=0.02)
 
 
@@ -177,9 +177,9 @@ def test_a_map_that_changes_on_disk_is_read_anew(lit, maps):
 
 
 @pytest.mark.slow
-def test_prepared_maps_are_bounded_in_bytes(start, lookups, maps):
+def test_prepared_maps_are_bounded_in_bytes(start, calculated, maps):
     """A quarter of the memory, which here holds one map and not two; the latest stays."""
-    local = start(models=lookups, environments=maps, memory=2**29)
+    local = start(models=calculated, environments=maps, memory=2**29)
     environments = local.service.environments
     for name in ("noon", "evening", "evening"):
         shade(local, environment=name)
@@ -255,7 +255,7 @@ def test_uploads_need_a_folder():
 
 def test_directions_of_the_ball_are_what_a_camera_sees():
     """The picture that these tests send: its upper left pixel looks up and to the left."""
-    ray = -picture(40)[0, 3:6, 0, 0]
+    ray = -picture(40, EFFECTS["ibl"].inputs)[0, 3:6, 0, 0]
     assert ray[0] < 0 < ray[1]
     assert ray[2] < -0.9
     assert directions(32, 64)[1, 0, 0] > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ from filelock import FileLock
 from safetensors.numpy import save
 
 from deepshade.attributes import ATTRIBUTES, RADIANCE
-from deepshade.bundles import CONFIG, Bundle
+from deepshade.bundles import CONFIG, Bundle, bundle_root
 from deepshade.effects import EFFECTS
 from deepshade.environments import Environment
 from deepshade.environments.stored import store
+from deepshade.errors import ConfigError
 from deepshade.manifest import Manifest, Shard
 from deepshade_trainer.export import export
 from deepshade_trainer.recipe import Recipe, preset
@@ -25,7 +27,6 @@ SIZE = 64
 RADIUS = 0.5
 # What a fold network of a few thousand parameters is, instead of a preset's million.
 TRUNK: dict[str, Any] = {"widths": (8, 12), "steps": (2,), "down": (1, 1), "up": (1,)}
-OPENINGS = {"kind": "openings", "trunk": TRUNK, "hidden": 4}
 SMALL = TRUNK | {"rings": (1,), "fine_rings": (1, 2), "detail": ()}
 
 
@@ -72,11 +73,6 @@ def reference(effect: str, inputs: dict[str, Any], seed: int) -> Any:
     return image.astype(row.storage)
 
 
-def opening(seed: int) -> Any:
-    """(64, SIZE, SIZE) bytes: which of 512 directions are open, at random."""
-    return np.random.default_rng([seed, 2]).integers(0, 256, (64, SIZE, SIZE), np.uint8)
-
-
 def write_data(folder: Path, effect: str, count: int = 8) -> Path:
     """A data folder of one shard with `count` views of as many scenes."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -87,8 +83,6 @@ def write_data(folder: Path, effect: str, count: int = 8) -> Path:
         sample = {**inputs, f"reference_{effect}": answer}
         if (beside := EFFECTS[effect].trivial_layer) is not None:
             sample.setdefault(beside, answer[::-1] / 2)  # with something to show beside the answer
-        if "environment" in EFFECTS[effect].settings:
-            sample[f"reference_{effect}_directions"] = opening(seed)
         samples.append(sample)
     schema = {
         name: {"dtype": str(v.dtype), "shape": list(v.shape)} for name, v in samples[0].items()
@@ -107,16 +101,29 @@ def write_data(folder: Path, effect: str, count: int = 8) -> Path:
     return folder
 
 
+def learns(effect: str) -> bool:
+    """Whether the balanced shader of an effect is learnt, not calculated."""
+    try:
+        preset("balanced", effect)
+    except ConfigError:
+        return False
+    return True
+
+
+LEARNT = [effect for effect in EFFECTS if learns(effect)]
+
+
 def small(effect: str, name: str) -> Recipe:
     """A preset, its network small if it is ours, for one step of two views."""
-    change = {"steps": 1, "batch": 2, "val_fraction": 0.2, "precision": "fp32", "init_from": ""}
+    change = {"steps": 1, "batch": 2, "val_fraction": 0.2, "precision": "fp32"}
     recipe = preset(name, effect).changed(**change)
-    shape = {"fold": SMALL, "carrier": TRUNK, "openings": OPENINGS}.get(recipe.network.kind, {})
+    shape = {"fold": SMALL, "carrier": TRUNK}.get(recipe.network.kind, {})
     return recipe.changed(network=shape)
 
 
 def make_bundle(effect: str, root: Path, name: str = "balanced") -> Bundle:
-    """`root`/<effect>/<name>: a bundle of an effect's preset, trained for one step.
+    """`root`/<effect>/<name>: a bundle of an effect's preset, trained for one step, or the shipped
+    one that is calculated.
 
     The run and the data are in `root`/runs and `root`/data. What another test made there, of this
     process or another, is taken: to export some of these takes half a minute.
@@ -124,7 +131,9 @@ def make_bundle(effect: str, root: Path, name: str = "balanced") -> Bundle:
     root.mkdir(parents=True, exist_ok=True)
     with FileLock(root / f"{effect}-{name}.lock"):
         folder, data = root / effect / name, root / "data" / effect
-        if not (folder / CONFIG).exists():
+        if name == "balanced" and effect not in LEARNT:
+            shutil.copytree(bundle_root() / effect / name, folder, dirs_exist_ok=True)
+        elif not (folder / CONFIG).exists():
             run = Run(root / "runs" / effect / name)
             list(train(small(effect, name), [write_data(data, effect)], run))
             export(run, folder, [data], radius=RADIUS)

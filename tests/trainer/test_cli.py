@@ -109,6 +109,7 @@ def test_names_of_scenes_leave_out_the_folders_they_share() -> None:
         (["train", "ao", "--data", "x", "--out", "run", "--set", "steps"], "key=value"),
         (["train", "ao", "--data", "x", "--out", "run", "--set", "stps=3"], "'steps'"),
         (["train", "aoo", "--data", "x", "--out", "run"], "aoo"),
+        (["train", "dof", "--data", "x", "--out", "run"], "train dof --preset paper"),
         (["evaluate", "nowhere", "--data", "x"], "missing"),
         (["export", "nowhere", "--out", "b", "--data", "x"], "no checkpoint"),
     ],

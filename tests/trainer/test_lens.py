@@ -11,9 +11,9 @@ import torch
 from deepshade.bundles import Bundle
 from deepshade.engines import load_engine, usable
 from deepshade.environments import Environment, Prepared, sky
+from deepshade_trainer.calculated import calculated, picture
 from deepshade_trainer.graph import session
-from deepshade_trainer.lookups import GIVEN, lens, picture
-from deepshade_trainer.networks import from_bundle
+from deepshade_trainer.networks import Shader, from_bundle
 from deepshade_trainer.networks.lens import ATTRIBUTES, Lens
 from deepshade_trainer.networks.reflections import Reflections
 
@@ -23,16 +23,16 @@ FOCAL = 19  # the last channel
 
 
 @pytest.fixture(scope="module")
-def shader() -> Lens:
-    return lens(Bundle.load(MODELS / "ao/fast"), Bundle.load(MODELS / "dof/balanced"))
+def shader() -> Shader:
+    return calculated("full", "lens", Bundle.load(MODELS / "ao/fast"))[1]
 
 
 @pytest.fixture(scope="module")
 def daylight() -> dict[str, np.ndarray]:
-    return Prepared.of(sky(height=32)).inputs(GIVEN, 20.0, "y")
+    return Prepared.of(sky(height=32)).inputs(Lens.environment, 20.0, "y")
 
 
-def answer(shader: Lens, gbuffer: np.ndarray, given: dict[str, np.ndarray]) -> np.ndarray:
+def answer(shader: Shader, gbuffer: np.ndarray, given: dict[str, np.ndarray]) -> np.ndarray:
     inputs = [torch.from_numpy(each) for each in (gbuffer, *given.values())]
     with torch.inference_mode():
         found: np.ndarray = shader(*inputs).numpy()
@@ -40,7 +40,7 @@ def answer(shader: Lens, gbuffer: np.ndarray, given: dict[str, np.ndarray]) -> n
 
 
 @pytest.mark.slow
-def test_in_focus_it_is_ibl_times_ao(shader: Lens, daylight: dict[str, np.ndarray]) -> None:
+def test_in_focus_it_is_ibl_times_ao(shader: Shader, daylight: dict[str, np.ndarray]) -> None:
     gbuffer = picture(96, ATTRIBUTES)
     gbuffer[:, FOCAL] = 0
     gbuffer[:, 18, :, :48] *= 0.9  # one half nearer: it occludes the other
@@ -54,7 +54,7 @@ def test_in_focus_it_is_ibl_times_ao(shader: Lens, daylight: dict[str, np.ndarra
 
 
 @pytest.mark.slow
-def test_it_is_linear_in_the_environment(shader: Lens, daylight: dict[str, np.ndarray]) -> None:
+def test_it_is_linear_in_the_environment(shader: Shader, daylight: dict[str, np.ndarray]) -> None:
     gbuffer = picture(64, ATTRIBUTES)
     other = daylight["lobes"][:, ::-1] ** 2
     both = {**daylight, "lobes": 300 * daylight["lobes"] + other}
@@ -67,7 +67,7 @@ def test_it_is_linear_in_the_environment(shader: Lens, daylight: dict[str, np.nd
 
 
 @pytest.mark.slow
-def test_the_white_furnace(shader: Lens) -> None:
+def test_the_white_furnace(shader: Shader) -> None:
     """An open white wall under a white map shows its reflectance, blurred or not."""
     white = Prepared.of(Environment("", np.ones((3, 8, 16), np.float32)))
     side = 96
@@ -78,13 +78,13 @@ def test_the_white_furnace(shader: Lens) -> None:
     gbuffer[:, 16], gbuffer[:, 17] = across, -across[:, None]
     gbuffer[:, 18] = -4
     gbuffer[:, FOCAL] = np.linspace(-30, 30, side)
-    found = answer(shader, gbuffer, white.inputs(GIVEN, 0.0, "y"))
+    found = answer(shader, gbuffer, white.inputs(Lens.environment, 0.0, "y"))
     assert found == pytest.approx(0.6, rel=0.03)
 
 
 @pytest.mark.slow
 def test_nothing_farther_than_the_halo_counts(
-    shader: Lens, daylight: dict[str, np.ndarray]
+    shader: Shader, daylight: dict[str, np.ndarray]
 ) -> None:
     """The left part of a wide picture, alone with its halo, is what it is in the whole."""
     ball = picture(64, ATTRIBUTES)
@@ -98,7 +98,7 @@ def test_nothing_farther_than_the_halo_counts(
 
 
 @pytest.mark.slow
-def test_every_engine_gives_the_same(shader: Lens, daylight: dict[str, np.ndarray]) -> None:
+def test_every_engine_gives_the_same(shader: Shader, daylight: dict[str, np.ndarray]) -> None:
     bundle = Bundle.load(SHIPPED)
     assert (bundle.size_multiple, bundle.halo) == (shader.size_multiple, shader.halo)
     gbuffer = picture(96, ATTRIBUTES)
@@ -112,7 +112,7 @@ def test_every_engine_gives_the_same(shader: Lens, daylight: dict[str, np.ndarra
 
 @pytest.mark.slow
 def test_16_and_8_bits_never_see_the_light(daylight: dict[str, np.ndarray]) -> None:
-    """What both trunks take and give stays to the last bit with 1,024 times the light."""
+    """What the trunk takes and gives stays to the last bit with 1,024 times the light."""
     import onnx
     from openvino import Core
 
@@ -120,11 +120,10 @@ def test_16_and_8_bits_never_see_the_light(daylight: dict[str, np.ndarray]) -> N
 
     bundle = Bundle.load(SHIPPED)
     pieces = split(Core().read_model(str(bundle.model)), bundle.float32, bundle.float32_after)
-    assert [piece.exact for piece in pieces] == [True, False, True, False, True]
-    trunks = pieces[1::2]
-    assert sorted(name for piece in trunks for name in piece.gives) == sorted(bundle.float32_after)
-    assert not trunks[1].channels
-    names = list(dict.fromkeys(n for piece in trunks for n in (*piece.taken, *piece.gives)))
+    assert [piece.exact for piece in pieces] == [True, False, True]
+    trunk = pieces[1]
+    assert sorted(trunk.gives) == sorted(bundle.float32_after)
+    names = list(dict.fromkeys((*trunk.taken, *trunk.gives)))
     graph = onnx.load(bundle.model)
     graph.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
     running = session(graph.SerializeToString())
@@ -134,4 +133,4 @@ def test_16_and_8_bits_never_see_the_light(daylight: dict[str, np.ndarray]) -> N
         names, running.run(names, feed), running.run(names, bright), strict=True
     ):
         assert (before == after).all(), name
-    assert {name.split(".")[0] for name in bundle.int8} == {"occlusion", "blur"}
+    assert {name.split(".")[0] for name in bundle.int8} == {"occlusion"}

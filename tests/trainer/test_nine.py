@@ -19,11 +19,12 @@ from deepshade_trainer.networks import Shader, build, from_bundle
 from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
 
-from .synthetic import RADIUS, arrays, make_bundle, small, write_data
+from .synthetic import LEARNT, RADIUS, arrays, make_bundle, small, write_data
+
+PRESETS = [("paper", each) for each in EFFECTS] + [("balanced", each) for each in LEARNT]
 
 
-@pytest.mark.parametrize("name", ["paper", "balanced"])
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize(("name", "effect"), PRESETS)
 def test_a_batch_has_the_channels_of_its_network(effect: str, name: str, tmp_path: Path) -> None:
     """Of an effect run per channel one colour channel, its own, drawn anew for each sample."""
     row = EFFECTS[effect]
@@ -80,8 +81,7 @@ def test_batches_made_on_the_device_repeat(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["paper", "balanced"])
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize(("name", "effect"), PRESETS)
 def test_every_effect_trains_and_exports(effect: str, name: str, made_once: Path) -> None:
     root = made_once / name
     bundle = make_bundle(effect, root, name)
@@ -127,7 +127,7 @@ def test_every_effect_trains_and_exports(effect: str, name: str, made_once: Path
     assert ("smape" in figures) == row.is_light
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", LEARNT)
 def test_a_picture_is_padded_as_everywhere(effect: str) -> None:
     row = EFFECTS[effect]
     shader = Shader(row, build(small(effect, "balanced").network))
@@ -145,7 +145,7 @@ def test_a_picture_is_padded_as_everywhere(effect: str) -> None:
     assert torch.equal(shader.padded(torch.from_numpy(plain)), torch.from_numpy(padded))
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", LEARNT)
 def test_what_is_learnt_is_the_answer_on_its_curve(effect: str) -> None:
     """In training nothing is clamped; the answer is its curve's inverse, and finite."""
     row = EFFECTS[effect]

@@ -21,17 +21,17 @@ from deepshade.environments import (
 )
 from deepshade.environments.stored import store
 from deepshade.manifest import Manifest, Shard
+from deepshade_trainer.calculated import export_calculated, picture
 from deepshade_trainer.evaluation import evaluate
-from deepshade_trainer.lookups import GIVEN, export_reflections, picture
 from deepshade_trainer.networks import phong
-from deepshade_trainer.networks.reflections import Reflections
+from deepshade_trainer.networks.reflections import ATTRIBUTES, Reflections, ReflectionsConfig
 
 COUNT = 64
 
 
 @pytest.fixture(scope="module")
 def shaders():
-    return {lobes: Reflections(lobes).eval() for lobes in (1, 2)}
+    return {lobes: Reflections(ReflectionsConfig(lobes=lobes)).eval() for lobes in (1, 2)}
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,10 @@ def gbuffer(normal, view, diffuse, specular, gloss):
 
 
 def answer(shader, prepared, planes, degrees=0.0, up="y"):
-    given = [torch.from_numpy(each) for each in prepared.inputs(GIVEN, degrees, up).values()]
+    given = [
+        torch.from_numpy(each)
+        for each in prepared.inputs(Reflections.environment, degrees, up).values()
+    ]
     with torch.inference_mode():
         return shader(torch.from_numpy(planes), *given).numpy()[0, :, 0]
 
@@ -180,9 +183,9 @@ def test_turned_is_as_from_elsewhere(shaders, soft, degrees, up):
 
 @pytest.mark.slow
 def test_every_engine_gives_the_same(tmp_path, shaders, soft):
-    bundle, _ = export_reflections(tmp_path / "ibl" / "small", lobes=1)
-    assert Bundle.load(bundle.path).environment == tuple(GIVEN)
-    planes = picture(48)
+    bundle, _ = export_calculated(tmp_path / "ibl" / "small", "reflections")
+    assert Bundle.load(bundle.path).environment == Reflections.environment
+    planes = picture(48, ATTRIBUTES)
     given = soft.inputs(bundle.environment, 20.0, "z")
     with torch.inference_mode():
         inputs = [torch.from_numpy(each) for each in (planes, *given.values())]
@@ -201,8 +204,8 @@ def test_every_engine_gives_the_same(tmp_path, shaders, soft):
 @pytest.mark.slow
 def test_samples_are_judged_under_their_own_environment(tmp_path, shaders, soft):
     """A data set whose references are the answers themselves, under a turned map."""
-    planes = picture(48)
-    given = soft.inputs(GIVEN, 65.0, "y")
+    planes = picture(48, ATTRIBUTES)
+    given = soft.inputs(Reflections.environment, 65.0, "y")
     with torch.inference_mode():
         inputs = [torch.from_numpy(each) for each in (planes, *given.values())]
         sample = {"reference_ibl": shaders[1](*inputs).numpy()[0]}
@@ -221,7 +224,7 @@ def test_samples_are_judged_under_their_own_environment(tmp_path, shaders, soft)
     digest = hashlib.sha256(content).hexdigest()
     schema = {n: {"dtype": "float32", "shape": list(a.shape)} for n, a in sample.items()}
     Manifest({}, schema, [Shard("shard-00000.safetensors", digest, [record])]).write(folder)
-    bundle, _ = export_reflections(tmp_path / "ibl" / "small", lobes=1)
+    bundle, _ = export_calculated(tmp_path / "ibl" / "small", "reflections")
     (row,) = evaluate(bundle, [folder], min_contrast=0)
     assert row.figures["dssim"] < 1e-5
     trivial = planes[:, 6:9] * soft.environment.mean[:, None, None]

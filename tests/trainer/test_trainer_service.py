@@ -291,6 +291,7 @@ def test_the_same_request_finds_the_same_job(client: httpx.Client) -> None:
     ("effect", "asked", "said"),
     [
         ("aoo", ASKED, "no effect"),
+        ("full", ASKED, "it has nothing to learn"),
         ("ao", {"steps": 4}, "one of data, upload and scene"),
         ("ao", ASKED | {"scene": "procedural:room:1"}, "not data and scene"),
         ("ao", ASKED | {"minutes": -1}, "minutes"),
