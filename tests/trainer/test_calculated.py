@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,7 @@ def test_a_calculated_shader_is_not_trained(effect: str) -> None:
         preset("balanced", effect)
     assert f"deepshade train {effect} --preset paper" in caught.value.fix
     paper = preset("paper", effect)  # as is said
+    assert preset("balanced", effect, asdict(paper.network)).network == paper.network
     with pytest.raises(ConfigError, match="nothing to learn"):
         paper.changed(network={"kind": "discs"})
 

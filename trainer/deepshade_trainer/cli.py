@@ -20,10 +20,7 @@ def train(
     data: Data,
     out: Annotated[Path, typer.Option(help="Run folder; an existing run goes on.")],
     preset: Annotated[
-        str,
-        typer.Option(
-            help="balanced, paper or paper-network; ao has fast and best, do and full no paper-network."
-        ),
+        str, typer.Option(help="balanced, paper or paper-network; ao has fast and best, too.")
     ] = "balanced",
     settings: Annotated[
         list[str] | None,

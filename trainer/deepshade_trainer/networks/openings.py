@@ -24,7 +24,7 @@ _LEVEL = 5  # the map is seen through lobes of exponent 2^LEVEL
 _SURFACE = 0.25  # the square of a normal's length; background has none
 _APART = 0.025  # distances from a pixel's plane at which a cell no longer tells of it, over depth
 _SMOOTHED = 0.15  # effect radii from which on cells don't lend each other what is blocked
-_TRUST = 0.75  # in `ao` of the trunk against W: so that a white map gives `ao` to .01
+_TRUST = 0.8  # in `ao` of the trunk against W: so that a white map gives `ao` to .01
 _MOST = 4.0  # what is blocked is multiplied by at most that, to be as much as `ao` says
 _LEAST = 0.02  # of that which is blocked, to be multiplied
 
