@@ -1,8 +1,7 @@
 """Write the bundles whose shaders are calculated into models/: nothing is trained here.
 
 `do` and `full` hold the weights of a bundle of `ao`, as they are. With --test, data sets of
-'deepshade datagen', they are measured and get their model cards; else only their graphs are
-written.
+'deepshade datagen', they are measured for their model cards, which else say that they weren't.
 
 python scripts/calculated.py --only ibl/balanced ibl/best full/balanced --test data/test-env
 """
@@ -57,7 +56,7 @@ def main() -> None:
         bundle, worst = export_calculated(root / name, of=part, **settings)
         if asked.test:
             bundle = measure(bundle, asked.test)
-            write_card(bundle, None, NOTES[bundle.effect].format(of) + _MORE)
+        write_card(bundle, None, NOTES[bundle.effect].format(of) + _MORE)
         print(f"{root / name} ({bundle.short_hash}), {worst:.1e} from torch")
 
 
