@@ -123,9 +123,8 @@ def write_bundle(
         if not worst <= TOLERANCE:
             raise DataError(f"ONNX Runtime differs from torch by {worst:.2e}, over {TOLERANCE:.0e}")
         side = up(_SIDE, shader.size_multiple)
-        float32, after = [OUTPUT], []
-        if rounded is not None:
-            float32, after = float32_marks(graph, rounded)
+        exact: tuple[list[str], list[str]] = [OUTPUT], []
+        float32, after = exact if rounded is None else float32_marks(graph, rounded)
         config = {
             "effect": effect.name,
             "name": folder.name,

@@ -113,7 +113,8 @@ class Openings(Network):
             less = _at_pixels(pixels, at, vectors)
             less, white = less[:, :-1], less[:, -1:]
             ratio = ((1 - occlusion) / white.clamp_min(_LEAST)).clamp(_LEAST**2, _MOST)
-            return irradiance - less * ratio**_TRUST * covers
+            answer: Tensor = irradiance - less * ratio**_TRUST * covers
+            return answer
 
     def _gathered(self, at: Tensor, blocked: Tensor, through: Tensor) -> Tensor:
         """Σ_k c_k Ω_k/π ω_k E_k in camera space, (N, 3, C + 1, h, w); the last for a white map."""
