@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ def export_calculated(
     Raises DataError: too far.
     """
     config, shader = calculated(folder.parent.name, kind, of, **settings)
-    spans = of.int8.items() if of else ()
+    int8 = {f"{_part(kind)}.{name}": span for name, span in of.int8.items()} if of else {}
     side = up(_SIDE, shader.size_multiple)
     return write_bundle(
         shader,
@@ -58,10 +59,11 @@ def export_calculated(
         folder,
         [torch.from_numpy(picture(side, shader.effect.inputs))],
         ranges=of.ranges if of else {},
-        int8=lambda _: {f"{_part(kind)}.{name}": span for name, span in spans},
+        int8=lambda _: int8,
     )
 
 
+@cache
 def _part(kind: str) -> str:
     """What of such a network is another's: only that may be rounded."""
     return (build(network_config({"kind": kind})).rounded or "").removesuffix(".")
