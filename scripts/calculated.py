@@ -29,9 +29,9 @@ works](../../../docs/environments.md)."""
 _TWO = _MAPS.format("`lobes` and `turn`")
 NOTES = {
     "do": "What is blocked is calculated: 12 slices through each cell of 4 x 4 pixels, 17 samples "
-    "up to 145 pixels away in each, sectors of equal solid angle. It is made to add up to what "
-    "`{}`, whose weights it holds, says under a white map. Sampling is coarse where a radius is "
-    "few pixels: contact shadows thinner than a cell are soft; what isn't in the picture blocks "
+    "up to 145 pixels away in each, sectors of equal solid angle. It is made to add up to nearly "
+    "what `{}`, whose weights it holds, says under a white map. Sampling is coarse where a radius "
+    "is few pixels: contact shadows thinner than a cell are soft; what isn't in the picture blocks "
     "nothing." + _MAPS.format("`lobes`, `turn` and `camera`"),
     "dof": "Light is spread over discs of six sizes, near and far side apart; all is calculated. "
     "Near edges of large circles are a little off where the picture doesn't show what is behind "
