@@ -22,6 +22,7 @@ import httpx
 import pytest
 import uvicorn
 
+from deepshade.bundles import bundle_root
 from deepshade.errors import BundleError, ConfigError
 from deepshade.serving import listen
 from deepshade.versions import Alias
@@ -233,7 +234,7 @@ def settings(
     return Settings(
         folder=tmp_path / "trainer",
         published=tmp_path / "models",
-        bases=(base.parents[1],),
+        bases=(base.parents[1], bundle_root()),
         data=(data.parent,),
         library=library,
         token=TOKEN,
