@@ -76,8 +76,8 @@ class Openings(Network):
             ("fit", fit),
             ("cosines", slices.sectors()[0].T * (slices.sectors()[1] / math.pi)),
         ):
-            constant = torch.from_numpy(np.ascontiguousarray(value, np.float32))
-            self.register_buffer(name, constant, persistent=False)
+            buffer = torch.from_numpy(np.ascontiguousarray(value, np.float32))
+            self.register_buffer(name, buffer, persistent=False)
 
     @property
     def size_multiple(self) -> int:
