@@ -21,11 +21,13 @@ from deepshade.bundles import CONFIG, Bundle
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing
+from deepshade_trainer import circles
 from deepshade_trainer.dataset import Batch, Dataset, batches
 from deepshade_trainer.lit import Lit
 from deepshade_trainer.losses import parse_loss
 from deepshade_trainer.networks import Network, Shader, build, bundle_weights
 from deepshade_trainer.networks.openings import Openings
+from deepshade_trainer.networks.perceptron import PerceptronConfig
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
@@ -78,6 +80,11 @@ def train(
         ConfigError: the run was begun with another recipe, or there is no such device.
         DataError: there is too little data, or almost all of it is non-finite.
     """
+    if isinstance(recipe.network, PerceptronConfig):
+        with _finish_on_signals() as stopped:
+            for step, loss, figures in circles.learn(recipe, folders, run, stopped):
+                yield Progress(step, recipe.steps, loss, figures)
+        return
     trainer = _Trainer(recipe, folders, run, device, split, every or Every())
     with _finish_on_signals() as stopped:
         yield from trainer.steps(stopped)
@@ -384,6 +391,8 @@ def _device(name: str) -> torch.device:
 
 
 def _optimizer(recipe: Recipe, network: Network) -> torch.optim.Optimizer:
+    if recipe.optimizer == "lbfgs":
+        raise ConfigError("optimizer", detail="lbfgs needs all samples at once: for perceptrons")
     weights, lr, decay = network.parameters(), recipe.lr, recipe.weight_decay
     if recipe.optimizer == "adadelta":
         # The paper's "momentum 0.9" is ADADELTA's decay of its running averages.

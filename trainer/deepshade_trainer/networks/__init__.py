@@ -19,6 +19,7 @@ from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet
 from deepshade_trainer.networks.network import Network
 from deepshade_trainer.networks.openings import Openings, OpeningsConfig
 from deepshade_trainer.networks.paper_unet import PaperConfig, PaperUNet
+from deepshade_trainer.networks.perceptron import Perceptron, PerceptronConfig
 from deepshade_trainer.networks.shader import Shader
 
 __all__ = [
@@ -29,10 +30,13 @@ __all__ = [
     "build",
     "bundle_weights",
     "from_bundle",
+    "inputs_of",
     "network_config",
 ]
 
-NetworkConfig = CarrierConfig | ChainConfig | FoldConfig | OpeningsConfig | PaperConfig
+NetworkConfig = (
+    CarrierConfig | ChainConfig | FoldConfig | OpeningsConfig | PaperConfig | PerceptronConfig
+)
 
 _KINDS: dict[str, tuple[Any, Any]] = {
     "carrier": (CarrierConfig, Carrier),
@@ -40,6 +44,7 @@ _KINDS: dict[str, tuple[Any, Any]] = {
     "fold": (FoldConfig, FoldUNet),
     "openings": (OpeningsConfig, Openings),
     "paper": (PaperConfig, PaperUNet),
+    "perceptron": (PerceptronConfig, Perceptron),
 }
 
 
@@ -78,6 +83,12 @@ def network_config(settings: Mapping[str, Any], base: NetworkConfig | None = Non
         for k, v in settings.items()
     }
     return dataclasses.replace(base, **values)
+
+
+def inputs_of(kind: str) -> tuple[str, ...]:
+    """The attributes that networks of a kind see, where they are other than the effect's."""
+    found: tuple[str, ...] = _KINDS[kind][1].attributes if kind in _KINDS else ()
+    return found
 
 
 def from_bundle(path: Path | str) -> Shader:

@@ -25,6 +25,8 @@ class Network(nn.Module, ABC):
     # Convolutions may be calculated in 16 and 8 bits where their weights' names begin so. If only
     # some may, all that doesn't lie between those is calculated in float32.
     rounded = ""
+    # What it sees, where that is something else than the effect's inputs.
+    attributes: tuple[str, ...] = ()
     # What it is given of an environment beside the G-buffer: names in `environments.INPUTS`.
     environment: tuple[str, ...] = ()
 
