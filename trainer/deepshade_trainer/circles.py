@@ -27,10 +27,10 @@ from deepshade_trainer.run import Run
 
 ITERATIONS = 10  # of L-BFGS in a step
 HISTORY = 50
-PATIENCE = 30  # steps without a better validation
+PATIENCE = 12  # steps without a better validation
 _SHARES = (0.5, 0.25)  # of views: training, validation; the rest is the test
 
-Part = tuple[Tensor, Tensor]  # normals (n, 48, 1, 1) and answers (n, outputs, 1, 1)
+Part = tuple[Tensor, Tensor]  # normals (1, 48, 1, n) and answers (1, outputs, 1, n)
 
 
 def parts(folders: Sequence[Path], recipe: Recipe) -> list[Part]:
@@ -58,12 +58,12 @@ def _part(data: Dataset, numbers: Sequence[int]) -> Part:
                 fix="render it with --pixels 512",
             )
         # point by point, x y z of each: as the network joins what it gathers
-        normals.append(around.transpose(2, 1, 0).reshape(-1, 3 * POINTS))
-        answers.append(answer[:, 0].T)
-    x, y = (torch.from_numpy(np.concatenate(each)) for each in (normals, answers))
+        normals.append(around.swapaxes(0, 1).reshape(3 * POINTS, 1, -1))
+        answers.append(answer)
+    x, y = (torch.from_numpy(np.concatenate(each, 2))[None] for each in (normals, answers))
     if not (torch.isfinite(x).all() and torch.isfinite(y).all()):
         raise DataError("some samples aren't finite", fix="render the data again")
-    return x[:, :, None, None], y[:, :, None, None]
+    return x, y
 
 
 def learn(

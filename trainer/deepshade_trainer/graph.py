@@ -78,6 +78,7 @@ def float32_marks(model: Any, rounded: str = "") -> tuple[list[str], list[str]]:
     comes before is arithmetic on lengths and light, which 16 bits would round (`Bundle.float32`);
     but shapes stay with their users, and so do channels taken out of the picture, which is no
     arithmetic. If any may, what follows them may be rounded too, and there are no second marks.
+    If none may, the whole graph is marked, by its output.
     """
     import onnx
 
@@ -97,6 +98,8 @@ def float32_marks(model: Any, rounded: str = "") -> tuple[list[str], list[str]]:
             later.update(node.output)
         elif node.op_type == "Shape" or constant.issuperset(sources):
             constant.update(node.output)
+    if not later:  # nothing may be rounded
+        return [value.name for value in graph.output], []
     inside: set[str] = set()  # what such a convolution depends on, and made by one
     for node in reversed(graph.node):
         if _convolves(node, rounded) or inside.intersection(node.output):

@@ -100,6 +100,8 @@ class _Trainer:
         split: Split | None,
         every: Every,
     ) -> None:
+        if recipe.optimizer == "lbfgs":
+            raise ConfigError("optimizer", detail="lbfgs needs all samples at once: perceptrons'")
         self.recipe, self.run, self.device = recipe, run, _device(device)
         self.every, self.rank, self.world = every, *_place()
         if recipe.batch % self.world:
@@ -391,8 +393,6 @@ def _device(name: str) -> torch.device:
 
 
 def _optimizer(recipe: Recipe, network: Network) -> torch.optim.Optimizer:
-    if recipe.optimizer == "lbfgs":
-        raise ConfigError("optimizer", detail="lbfgs needs all samples at once: for perceptrons")
     weights, lr, decay = network.parameters(), recipe.lr, recipe.weight_decay
     if recipe.optimizer == "adadelta":
         # The paper's "momentum 0.9" is ADADELTA's decay of its running averages.

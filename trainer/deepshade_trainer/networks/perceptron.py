@@ -44,7 +44,7 @@ class Perceptron(Network):
     """See the module. Weights of the first layer go by points, then by x, y, z."""
 
     attributes = ("normal_object",)
-    rounded = "none"  # a few hundred weights, and 8 bits of tanh would show as bands
+    rounded = "none."  # a few hundred weights, and 8 bits of tanh would show as bands
 
     def __init__(self, config: PerceptronConfig) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class Perceptron(Network):
         """See `Network.forward`. Past the picture there is no normal: 0."""
         reach = self.circle
         if not reach:
-            return self.answered(gbuffer.repeat(1, POINTS, 1, 1))
+            return self.answered(torch.cat([gbuffer] * POINTS, 1))
         wide = F.pad(gbuffer, (reach, reach, reach, reach))
         around = [
             F.pad(wide, (-reach - x, x - reach, -reach - y, y - reach))  # one operation

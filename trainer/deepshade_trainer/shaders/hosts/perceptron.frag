@@ -10,6 +10,7 @@ layout(std140) uniform Perceptron {
 uniform sampler2D normals;  // object space, 0 where there is no surface
 uniform float reach;        // pixels: CIRCLE, or 0 for the pixel alone
 uniform float down;         // 1 where row 0 is the top, -1 where it is the bottom
+uniform ivec2 widths = ivec2(WIDE, HIGH);  // no constants: unrolled loops compile for minutes
 out float openness;
 
 vec3 normalAt(ivec2 at) {
@@ -34,7 +35,7 @@ void main() {
   }
   int at = 0;
   float first[WIDE];
-  for (int j = 0; j < WIDE; j++) {
+  for (int j = 0; j < widths.x; j++) {
     first[j] = weights[12 * WIDE + j / 4][j % 4];
     for (int k = 0; k < 12; k++) { first[j] += dot(weights[at++], seen[k]); }
     first[j] = tanh(first[j]);
@@ -42,9 +43,9 @@ void main() {
   at += WIDE / 4;
   float answer = bias;
   int ends = at + WIDE / 4 * HIGH;
-  for (int j = 0; j < HIGH; j++) {
+  for (int j = 0; j < widths.y; j++) {
     float second = weights[ends + j / 4][j % 4];
-    for (int k = 0; k < WIDE; k += 4) {
+    for (int k = 0; k < widths.x; k += 4) {
       second += dot(weights[at++], vec4(first[k], first[k + 1], first[k + 2], first[k + 3]));
     }
     answer += weights[ends + (HIGH + j) / 4][j % 4] * tanh(second);
