@@ -75,7 +75,7 @@ class Shot:
     @property
     def shown(self) -> NDArray[np.bool_]:
         """(H, W): where there is a surface."""
-        found: NDArray[np.bool_] = self.images["normal_object"].any(0)
+        found: NDArray[np.bool_] = np.asarray(self.images["normal_object"].any(0))
         return found
 
 
@@ -262,7 +262,9 @@ def main(
         typer.echo(json.dumps(results))
         return
     typer.echo("\n".join(table(results)))
-    typer.echo(f"pictures: {', '.join(map(str, sheet))}: reference, then the table's rows but white")
+    typer.echo(
+        f"pictures: {', '.join(map(str, sheet))}: reference, then the table's rows but white"
+    )
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from deepshade.bundles import write_config
+from deepshade.effects import EFFECTS
 from deepshade.errors import EngineError
 from deepshade_report import programs
 from deepshade_trainer.export import write_onnx
@@ -14,7 +15,6 @@ from deepshade_trainer.graph import session
 from deepshade_trainer.networks import Shader, build
 from deepshade_trainer.recipe import preset
 from deepshade_trainer.shaders.perceptron import write_uniform_shader
-from deepshade.effects import EFFECTS
 
 SIZES = {"mlp-16x8": 3_716, "mlp-32x16": 8_452, "mlp-64x32": 20_996}
 

@@ -112,7 +112,11 @@ def learn(
                 tested = _figures(network.answered(test[0]), test)
             figures = _figures(network.answered(validation[0]).detach(), validation) | blank
             figures |= {f"test_{name}": found for name, found in tested.items()}
-            run.save({"model": network.state_dict(), "average": kept}, step, {"state": {}, "param_groups": []})
+            run.save(
+                {"model": network.state_dict(), "average": kept},
+                step,
+                {"state": {}, "param_groups": []},
+            )
             with replacing(run.metrics) as part:
                 part.write_text(json.dumps([{"step": step, **figures}], indent=1))
             yield step, value, figures

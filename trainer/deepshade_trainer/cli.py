@@ -20,7 +20,8 @@ def train(
     data: Data,
     out: Annotated[Path, typer.Option(help="Run folder; an existing run goes on.")],
     preset: Annotated[
-        str, typer.Option(help="balanced, paper or paper-network; ao has fast, best and perceptrons.")
+        str,
+        typer.Option(help="balanced, paper or paper-network; ao has fast, best and perceptrons."),
     ] = "balanced",
     settings: Annotated[
         list[str] | None,

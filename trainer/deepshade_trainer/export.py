@@ -83,9 +83,7 @@ def export(
     """
     recipe, shader = load_shader(run, network)
     effect = EFFECTS[recipe.effect]
-    trained, held = gbuffers(
-        recipe, data, shader.per_channel, shader.size_multiple, shader.inputs
-    )
+    trained, held = gbuffers(recipe, data, shader.per_channel, shader.size_multiple, shader.inputs)
     fixed = None if lengths(shader.inputs) else learnt_radius(recipe, data, shader)
     folder.mkdir(parents=True, exist_ok=True)
     with scratch(folder / MODEL) as file:  # what is there stays until all is done

@@ -30,11 +30,11 @@ CHOICES = {
 class Recipe:
     """Settings of a run; the defaults are ours.
 
-    `optimizer` is "adamw", "adadelta" or, for perceptrons, "lbfgs"; `schedule` "cosine" (after `warmup` steps) or
-    "constant"; `precision` "bf16" or "fp32"; `ema` the weight average's decay a step (0: none);
-    `clip` bounds the gradient's norm (0: none). `val_fraction` of the scenes are validated on and
-    not trained on. `init_from` is the folder of a run, whose averaged weights to begin with, or of
-    a bundle; where names and shapes agree ("": at random).
+    `optimizer` is "adamw", "adadelta" or, for perceptrons, "lbfgs"; `schedule` "cosine" (after
+    `warmup` steps) or "constant"; `precision` "bf16" or "fp32"; `ema` the weight average's decay a
+    step (0: none); `clip` bounds the gradient's norm (0: none). `val_fraction` of the scenes are
+    validated on and not trained on. `init_from` is the folder of a run, whose averaged weights to
+    begin with, or of a bundle; where names and shapes agree ("": at random).
     """
 
     effect: str = "ao"

@@ -287,7 +287,8 @@ def datagen(
         str, typer.Option(help="More to render, commas between: do_directions.")
     ] = "",
     attributes: Annotated[
-        str, typer.Option(help="Attributes to store beside the effects' inputs: normal_object, say.")
+        str,
+        typer.Option(help="Attributes to store beside the effects' inputs: normal_object, say."),
     ] = "",
     pixels: Annotated[
         int,

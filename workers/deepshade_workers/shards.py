@@ -25,7 +25,7 @@ def schema(
     layers: Sequence[str] = (),
     attributes: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """Tensors of a data set for `effects`: their inputs, references and errors, and what is beside."""
+    """Tensors of a data set for `effects`: their inputs and references, and more beside."""
     tensors: dict[str, dict[str, Any]] = {}
     for row in (EFFECTS[effect] for effect in effects):
         for attribute in (ATTRIBUTES[name] for name in (*row.inputs, *attributes)):

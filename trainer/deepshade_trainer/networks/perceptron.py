@@ -7,6 +7,7 @@ layers with tanh, a linear output. One network knows one mesh.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -50,9 +51,7 @@ class Perceptron(Network):
         super().__init__()
         self.circle = config.circle
         sides = (config.inputs * POINTS, *config.widths)
-        self.hidden = nn.ModuleList(
-            nn.Conv2d(a, b, 1) for a, b in zip(sides, sides[1:], strict=False)
-        )
+        self.hidden = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in itertools.pairwise(sides))
         self.last = nn.Conv2d(sides[-1], config.outputs, 1)
         for layer in (*self.hidden, self.last):
             nn.init.xavier_uniform_(layer.weight)

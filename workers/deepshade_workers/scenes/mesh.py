@@ -164,9 +164,7 @@ class Mesh:
         return replace(self, faces=self.faces[:, ::-1], normals=self.normals[:, ::-1], paint=paint)
 
 
-def merge(
-    meshes: Iterable[Mesh], names: Sequence[str] = (), frames: Sequence[Floats] = ()
-) -> Mesh:
+def merge(meshes: Iterable[Mesh], names: Sequence[str] = (), frames: Sequence[Floats] = ()) -> Mesh:
     """One mesh of all, so that a ray tracer sees a single shape.
 
     `names`, one for each mesh, say which objects they belong to: neighbours of equal name are one.

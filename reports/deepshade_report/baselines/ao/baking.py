@@ -174,9 +174,7 @@ def _openness(
     """(n,) of points with shading and geometric normals (n, 3), in 255ths."""
     count = len(where)
     ns, ng = (
-        mi.Vector3f(
-            *(mi.Float(row) for row in _unit(each).T.astype(np.float32, order="C").copy())
-        )
+        mi.Vector3f(*(mi.Float(row) for row in _unit(each).T.astype(np.float32, order="C").copy()))
         for each in (normals, flats)
     )
     points = mi.Point3f(*(mi.Float(row) for row in where.T.astype(np.float32, order="C").copy()))
