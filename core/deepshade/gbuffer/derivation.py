@@ -35,7 +35,7 @@ REQUIREMENT_FIXES: dict[Requirement, str] = {
     "lens": "give the full horizontal angle, the focus distance and the aperture's diameter, or "
     "write deepshade:fov, deepshade:focus and deepshade:aperture",
     "unmoved": "where all objects are placed and turned as they were modelled, object space is "
-    "world space: write deepshade:unmoved 1",
+    "world space: write deepshade:unmoved 1 (--map normal_object=<layer> says so too)",
 }
 
 

@@ -56,7 +56,7 @@ class Vertices:
 
 @dataclass(frozen=True)
 class Texels:
-    """Values of all triangles' nodes; a triangle has the resolution (F,), its first node `start`."""
+    """Values of all triangles' nodes; triangles have a resolution (F,) and a first node."""
 
     values: Bytes
     start: Ints
