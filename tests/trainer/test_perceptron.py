@@ -52,7 +52,7 @@ def trained(tmp_path_factory):
     root = tmp_path_factory.mktemp("perceptron")
     data = data_set(root / "data")
     run = Run(root / "run")
-    recipe = preset("mlp-16x8", "ao").changed(steps=4)
+    recipe = preset("mlp-16x8", "ao").changed(steps=15)
     last = list(train(recipe, [data], run))[-1]
     bundle, _ = export(run, root / "models" / "ao" / "made", [data])
     return data, run, last, bundle
@@ -121,7 +121,7 @@ def test_training_learns_from_views_that_it_does_not_test_on(trained):
     assert [y.unique().numel() > 100 for _, y in parts] == [True] * 3
     assert bundle.inputs == ("normal_object",) and bundle.radius == pytest.approx(0.3)
     assert bundle.exact and bundle.halo == 10
-    assert not list(train(preset("mlp-16x8", "ao").changed(steps=4), [data], run))  # it is done
+    assert not list(train(preset("mlp-16x8", "ao").changed(steps=15), [data], run))  # it is done
 
 
 def test_a_bundle_may_look_at_the_pixel_alone(trained, tmp_path):
