@@ -30,6 +30,7 @@ LENGTH = Unit("length", "float32", scaled=True)
 POINT = Unit("length", "float32", scaled=True, turns="camera")  # a place: lengths with a direction
 CAMERA_DIRECTION = Unit("direction, camera", turns="camera")
 WORLD_DIRECTION = Unit("direction, world")
+OBJECT_DIRECTION = Unit("direction, object")  # of the frame that an object was modelled in
 PIXELS = Unit("pixels", "float32")
 SCREEN_MOTION = Unit("pixels", "float32", turns="screen")  # u right, v down
 RADIANS = Unit("radians")
@@ -83,6 +84,7 @@ _TABLE = (
     Attribute("position", "P_s", _xyz("position"), POINT, "camera-space position"),
     Attribute("normal", "N_s", _xyz("normal"), CAMERA_DIRECTION, "shading normal, camera space"),
     Attribute("normal_world", "N_w", _xyz("normal_world"), WORLD_DIRECTION, "normal, world space"),
+    Attribute("normal_object", "N_o", _xyz("normal_object"), OBJECT_DIRECTION, "object space"),
     Attribute("depth", "D_s", ("Z",), LENGTH, "planar depth, -P_s.z, > 0"),
     Attribute("focal", "D_focal", ("focal.V",), PIXELS, "signed diameter of the blur circle", True),
     Attribute("view", "C_w", _xyz("view"), WORLD_DIRECTION, "unit direction to the camera", True),

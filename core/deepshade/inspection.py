@@ -275,6 +275,7 @@ def _statistics(plan: Plan, bodies: Sequence[bytes], limits: Limits) -> dict[str
     import numpy as np
 
     from deepshade import exr
+    from deepshade.gbuffer.conventions import NORMALS
 
     result: dict[str, Any] = {}
     for index, body in enumerate(bodies):
@@ -293,7 +294,7 @@ def _statistics(plan: Plan, bodies: Sequence[bytes], limits: Limits) -> dict[str
                 "min": inside.min(1).tolist() if inside.size else None,
                 "max": inside.max(1).tolist() if inside.size else None,
             }
-            if name in ("normal", "normal_world") and inside.size:
+            if name in NORMALS and inside.size:
                 lengths = np.sqrt((inside.astype(np.float64) ** 2).sum(0))
                 lit = lengths[lengths > 0]
                 row["zero"] = int(lengths.size - lit.size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from deepshade import tensors
+from deepshade.attributes import ATTRIBUTES
 from deepshade.bundles import Bundle
 from deepshade.effects import EFFECTS, SETTINGS
 from deepshade.effects.settings import MAX_LENGTH, MIN_LENGTH
@@ -39,6 +40,8 @@ def radius_of(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> Radiu
         value, source = stored(gbuffer, _SETTING, "; ?radius= overrides it"), "header"
     if value is None:
         value, source = Share(_SETTING.share), "depth"
+    if not any(ATTRIBUTES[name].unit.scaled for name in bundle.inputs):
+        return Radius(bundle.radius, "bundle", warning=_fixed(bundle, value, source))
     depth = tensors.median_depth(gbuffer.attributes)
     if not isinstance(value, Share):
         return Radius(value, source, warning=_warning(value, depth) if depth else "")
@@ -47,6 +50,17 @@ def radius_of(gbuffer: GBuffer, bundle: Bundle, asked: ShadeParameters) -> Radiu
     radius = _part(value, depth)
     derived = f"{radius:g}, {_percent(value)} of the median depth {depth:.4g}"
     return Radius(radius, source, derived, _warning(radius, depth))
+
+
+def _fixed(bundle: Bundle, value: float | Share, source: str) -> str:
+    """What to say of a radius that a bundle which sees no lengths can't follow."""
+    known = not isinstance(value, Share) and abs(value - bundle.radius) <= 0.01 * bundle.radius
+    if known or source == "depth":
+        return ""
+    return (
+        f"{bundle.name} knows one mesh at the radius {bundle.radius:.4g} that it learnt, and can't "
+        "follow another: leave ?radius= out, or choose another ?bundle="
+    )
 
 
 def _part(share: float, depth: float) -> float:

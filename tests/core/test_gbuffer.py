@@ -317,6 +317,22 @@ def test_ambiguity_is_never_resolved_by_a_guess(channels):
     assert len(caught.value.candidates) >= 2
 
 
+def test_object_space_is_world_space_only_where_nothing_was_moved():
+    normal = {f"normal_world.{axis}": np.full((6, 6), 0.6 * (axis != "Z")) for axis in "XYZ"}
+    normal = {name: plane.astype(np.float32) for name, plane in normal.items()}
+    with pytest.raises(CameraError, match="never moved") as caught:
+        load_gbuffer(encode(normal, {}), ["normal_object"])
+    assert "deepshade:unmoved" in caught.value.fix
+    found = load_gbuffer(
+        encode(normal, {"deepshade:unmoved": "1"}), ["normal_object", "normal_world"]
+    )
+    assert (found.attributes["normal_object"] == found.attributes["normal_world"]).all()
+    mapped = load_gbuffer(
+        encode(normal, {}), ["normal_object"], mapping={"normal_object": "normal_world"}
+    )
+    assert (mapped.attributes["normal_object"] == found.attributes["normal_world"]).all()
+
+
 def test_missing_attributes_name_near_misses():
     with pytest.raises(MissingAttributeError) as caught:
         load_gbuffer(encode(layer("nornal", N) | layer("RGB", N, "RGB")), NEEDS)

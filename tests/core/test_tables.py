@@ -19,6 +19,7 @@ CANONICAL = {
     "position": "position.X position.Y position.Z",
     "normal": "normal.X normal.Y normal.Z",
     "normal_world": "normal_world.X normal_world.Y normal_world.Z",
+    "normal_object": "normal_object.X normal_object.Y normal_object.Z",
     "depth": "Z",
     "focal": "focal.V",
     "view": "view.X view.Y view.Z",

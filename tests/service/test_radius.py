@@ -1,9 +1,16 @@
 """Which radius a picture is shaded at: the one named, else a share of its median depth."""
 
+import io
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from deepshade import exr
+from deepshade.bundles import Bundle
+from deepshade.gbuffer import load_gbuffer
+from deepshade_service.parameters import ShadeParameters
+from deepshade_service.radius import radius_of
 
 EXR = {"Content-Type": "image/x-exr"}
 
@@ -92,3 +99,15 @@ def test_a_picture_of_nearly_or_only_background(client, make_exr, make_picture):
         plan = shade(client, make_exr(view), "&explain=1").json()
         expected = (30.0, "depth") if count else (0.5, "bundle")
         assert (plan["radius"], plan["radius_source"]) == expected
+
+
+@pytest.mark.parametrize(("asked", "warned"), [(None, False), (0.3, False), (2.0, True)])
+def test_a_bundle_that_sees_no_lengths_keeps_its_radius_and_says_so(asked, warned):
+    inputs = ("normal_object",)
+    bundle = Bundle(Path(), "ao", "cat", inputs, ("Y",), 0.3, 50.0, 1, 10, 400)
+    body = io.BytesIO()
+    exr.write(body, {f"normal_object.{axis}": np.ones((8, 8), np.float32) for axis in "XYZ"})
+    gbuffer = load_gbuffer(body.getvalue(), inputs)
+    found = radius_of(gbuffer, bundle, ShadeParameters(radius=asked))
+    assert (found.value, found.source) == (0.3, "bundle")
+    assert bool(found.warning) == warned

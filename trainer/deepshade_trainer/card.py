@@ -107,7 +107,7 @@ def write_card(bundle: Bundle, run: Run | None, note: str) -> None:
         + (
             f" Lengths are divided by the effect radius ({SETTINGS['radius'].default} unless the "
             "request or the image's header names one), so any scene scale works."
-            if effect.lengths == "radius"
+            if effect.lengths == "radius" and lengths(bundle.inputs)
             else " Lengths are divided by the picture's median depth."
             if lengths(bundle.inputs)
             else ""

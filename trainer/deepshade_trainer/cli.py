@@ -20,7 +20,8 @@ def train(
     data: Data,
     out: Annotated[Path, typer.Option(help="Run folder; an existing run goes on.")],
     preset: Annotated[
-        str, typer.Option(help="balanced, paper or paper-network; ao has fast and best, too.")
+        str,
+        typer.Option(help="balanced, paper or paper-network; ao has fast, best and perceptrons."),
     ] = "balanced",
     settings: Annotated[
         list[str] | None,
@@ -39,6 +40,8 @@ def train(
 --set steps=60 --set warmup=6 --set lr=0.0008
 
     deepshade train ao --data data/ao --out runs/paper --preset paper --set steps=6000
+
+    deepshade train ao --data data/cat --out runs/cat --preset mlp-16x8
     """
     import torch
 
@@ -68,6 +71,11 @@ def train(
 def _figures(progress: Progress) -> str:
     """A validation in a line."""
     found = progress.figures or {}
+    if "test_rmse" in found:
+        return (
+            f"step {progress.step}: error (RMSE) {found['rmse']:.4f} held out, "
+            f"{found['test_rmse']:.4f} on the test, the mean answer's {found['trivial_rmse']:.4f}"
+        )
     loss = f"loss {progress.loss:.4f}  " if progress.step else ""
     return (
         f"step {progress.step}: {loss}held-out DSSIM {found['dssim']:.4f} "
@@ -156,6 +164,10 @@ def export(
     radius: Annotated[
         float, typer.Option(help="Effect radius where a picture has no depth, scene units.")
     ] = 1.0,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Change the network where no weights do: network.circle=0."),
+    ] = None,
     note: Annotated[Path | None, typer.Option(help="Text that ends the model card.")] = None,
     to: Annotated[
         str, typer.Option(help="A bundle for another program: onnx, glsl, wgsl, hlsl or npz.")
@@ -201,7 +213,10 @@ def export(
         ending = note.read_text() if note else ""
     except OSError as error:
         raise ConfigError("note", detail=f"can't read {note}: {error.strerror}") from error
-    bundle, worst = write(Run(run), out, data, radius=radius)
+    changes = _parse(settings or [])
+    if set(changes) - {"network"}:
+        raise ConfigError("set", detail="--set can change only network.… of a run that is trained")
+    bundle, worst = write(Run(run), out, data, radius=radius, network=changes.get("network"))
     write_card(bundle, Run(run), ending)  # a bundle has one, whatever its measurement meets
     typer.echo(f"{out}: sha256 {bundle.short_hash}, ONNX Runtime within {worst:.1e} of torch")
     if test:

@@ -56,20 +56,27 @@ class Dataset:
     """All samples of one effect in one or several data folders.
 
     `per_channel` says whether networks see one colour channel; None: as the effect's row does.
+    `inputs` are what they see, where that is something else than the effect's inputs.
 
     Raises:
         DataError: a folder holds no manifest, lacks a shard, or was made for other effects.
     """
 
     def __init__(
-        self, folders: Sequence[Path], effect: str, *, per_channel: bool | None = None
+        self,
+        folders: Sequence[Path],
+        effect: str,
+        *,
+        per_channel: bool | None = None,
+        inputs: Sequence[str] = (),
     ) -> None:
         self.effect = EFFECTS[effect]
+        self.inputs = tuple(inputs) or self.effect.inputs
         self.per_channel = self.effect.per_channel if per_channel is None else per_channel
         self.reference = f"reference_{effect}"
         beside = self.effect.trivial_layer
         self.layers = tuple(
-            dict.fromkeys([*self.effect.inputs, self.reference, *([beside] if beside else [])])
+            dict.fromkeys([*self.inputs, self.reference, *([beside] if beside else [])])
         )
         self.entries: list[Entry] = []
         self._open: dict[Path, Any] = {}
@@ -79,9 +86,11 @@ class Dataset:
             if missing:
                 effects = {effect, *missing.intersection([beside])}
                 names = ",".join(sorted(name.removeprefix("reference_") for name in effects))
+                more = ",".join(sorted(missing - set(self.effect.inputs) & set(self.inputs)))
                 raise DataError(
                     f"{folder} has no {', '.join(sorted(missing))}",
-                    fix=f"render it with --effects {names}",
+                    fix=f"render it with --effects {names}"
+                    + (f" --attributes {more}, or --pixels 512 to train on" if more else ""),
                 )
             for shard in manifest.shards:
                 path = shard_path(folder, shard)
@@ -161,7 +170,7 @@ class Dataset:
 
         Sides are padded to multiples of `multiple`.
         """
-        given = self.effect, sample, self.effect.inputs, radius
+        given = self.effect, sample, self.inputs, radius
         return tensors.tensor(*given, per_channel=self.per_channel, multiple=multiple)
 
     def batch(self, numbers: Sequence[int], rng: np.random.Generator) -> tuple[Tensor, Tensor]:

@@ -127,7 +127,7 @@ def evaluate(
         EngineError: this machine or this bundle lacks the backend.
     """
     data, shader = (
-        Dataset(folders, bundle.effect, per_channel=bundle.per_channel),
+        Dataset(folders, bundle.effect, per_channel=bundle.per_channel, inputs=bundle.inputs),
         Shaded(bundle, backend),
     )
     effect, variant = data.effect, variant or Variant()
@@ -145,7 +145,7 @@ def evaluate(
         contrast = judging.contrast(effect, reference, blank)
         if contrast < least:
             continue
-        changed, radius = variant.apply(sample, effect.inputs, data.radius(number))
+        changed, radius = variant.apply(sample, bundle.inputs, data.radius(number))
         image = shader(data, changed, radius, lit)
         ours, truth, nothing = judging.exposed(effect, reference, image, reference, blank)
         figures = compare(ours, truth, nothing)

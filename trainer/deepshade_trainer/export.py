@@ -20,10 +20,10 @@ from torch import Tensor
 from deepshade.bundles import MODEL, Bundle, write_config
 from deepshade.effects import EFFECTS
 from deepshade.environments import Prepared, sky
-from deepshade.errors import DataError
+from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing, scratch
 from deepshade.tensors import up
-from deepshade_trainer.dataset import Dataset, spread
+from deepshade_trainer.dataset import Dataset, lengths, spread
 from deepshade_trainer.graph import (
     bytes_per_pixel,
     float32_marks,
@@ -43,17 +43,23 @@ PARITY_SAMPLES, RANGE_SAMPLES = 8, 24
 _SIDE = 256  # of the picture whose memory is counted
 
 
-def load_shader(run: Run) -> tuple[Recipe, Shader]:
+def load_shader(run: Run, network: Mapping[str, Any] | None = None) -> tuple[Recipe, Shader]:
     """A run's recipe, and its shader with averaged weights in evaluation mode.
 
-    Raises DataError: the run has no checkpoint.
+    `network` are settings of it to change that no weights depend on.
+
+    Raises DataError: the run has no checkpoint. ConfigError: its weights don't fit the change.
     """
     if not run.checkpoint.exists():
         raise DataError(f"{run.folder} holds no checkpoint", fix="train first: deepshade train")
     recipe = Recipe.read(run.recipe)
-    network = build(recipe.network)
-    network.load_state_dict(run.load()[0]["average"])
-    return recipe, Shader(EFFECTS[recipe.effect], network).eval()
+    recipe = recipe.changed(network=dict(network or {}))
+    made, weights = build(recipe.network), run.load()[0]["average"]
+    shapes = {name: each.shape for name, each in made.state_dict().items()}
+    if shapes != {name: each.shape for name, each in weights.items()}:
+        raise ConfigError("network", detail="--set network.… here needs other weights: train anew")
+    made.load_state_dict(weights)
+    return recipe, Shader(EFFECTS[recipe.effect], made).eval()
 
 
 def export(
@@ -64,18 +70,21 @@ def export(
     radius: float = 1.0,
     fov: float = 50.0,
     metrics: dict[str, Any] | None = None,
+    network: Mapping[str, Any] | None = None,
 ) -> tuple[Bundle, float]:
     """The bundle `folder` (its last two names are effect and name) from `run`, and its parity.
 
     That is the largest difference between ONNX Runtime and torch over G-buffers of `data` that
     were not trained on, where there are such. `radius` is the effect radius, in scene units, of
-    requests that name none, `fov` the horizontal angle in degrees that `data` was seen at.
+    requests that name none, `fov` the horizontal angle in degrees that `data` was seen at;
+    `network` as of `load_shader`.
 
     Raises DataError: the difference exceeds `TOLERANCE`; no configuration is then written.
     """
-    recipe, shader = load_shader(run)
-    trained, held = gbuffers(recipe, data, shader.per_channel, shader.size_multiple)
-    pictures, rounded = [each.numpy() for each in trained], shader.network.rounded or ""
+    recipe, shader = load_shader(run, network)
+    trained, held = gbuffers(recipe, data, shader.per_channel, shader.size_multiple, shader.inputs)
+    fixed = None if lengths(shader.inputs) else learnt_radius(recipe, data, shader)
+    pictures, rounded = [each.numpy() for each in trained], shader.network.rounded
     return write_bundle(
         shader,
         recipe.network,
@@ -88,8 +97,8 @@ def export(
             )
             for name, place in shader.places.items()
         },
-        int8=lambda graph: int8_ranges(graph, INPUT, pictures, rounded),
-        radius=radius,
+        int8=lambda graph: {} if rounded is None else int8_ranges(graph, INPUT, pictures, rounded),
+        radius=fixed or radius,
         fov=fov,
         metrics=metrics,
     )
@@ -128,7 +137,7 @@ def write_bundle(
         config = {
             "effect": effect.name,
             "name": folder.name,
-            "inputs": effect.inputs,
+            "inputs": shader.inputs,
             "outputs": effect.outputs,
             "radius": radius,
             "fov": fov,
@@ -150,13 +159,17 @@ def write_bundle(
 
 
 def gbuffers(
-    recipe: Recipe, folders: Sequence[Path], per_channel: bool, multiple: int = 1
+    recipe: Recipe,
+    folders: Sequence[Path],
+    per_channel: bool,
+    multiple: int = 1,
+    inputs: Sequence[str] = (),
 ) -> tuple[list[Tensor], list[Tensor]]:
     """G-buffers (N, C, H, W) of samples that were trained on, and of some that were held out.
 
     Where none was held out, the second are of the first.
     """
-    samples = Dataset(folders, recipe.effect, per_channel=per_channel)
+    samples = Dataset(folders, recipe.effect, per_channel=per_channel, inputs=inputs)
     training, held = samples.split(recipe.val_fraction, seed=recipe.seed)
 
     def some(numbers: Sequence[int], count: int) -> list[Tensor]:
@@ -165,6 +178,21 @@ def gbuffers(
         return [torch.from_numpy(gbuffer) for gbuffer in found]
 
     return some(training, RANGE_SAMPLES), some(held or training, PARITY_SAMPLES)
+
+
+def learnt_radius(recipe: Recipe, folders: Sequence[Path], shader: Shader) -> float:
+    """The radius, in scene units, of samples of which a network sees no lengths: the one it knows.
+
+    Raises DataError: it learnt several as if they were one.
+    """
+    samples = Dataset(folders, recipe.effect, inputs=shader.inputs)
+    found = {samples.radius(k) for k in range(len(samples.entries))}
+    if EFFECTS[recipe.effect].lengths == "radius" and max(found) > 1.001 * min(found):
+        raise DataError(
+            f"the radii go from {min(found):g} to {max(found):g}, and the network sees no lengths",
+            fix="train on one mesh, with 'deepshade datagen --radius' or none",
+        )
+    return max(found)
 
 
 def write_onnx(shader: Shader, path: Path) -> Any:

@@ -85,6 +85,14 @@ def _shaders(bundle: Bundle, language: str, folder: Path, size: Size) -> None:
     target = folder / f"{bundle.effect}-{bundle.name}-{size[0]}x{size[1]}-{language}"
     told = {key.removeprefix("deepshade:"): value for key, value in facts(bundle).items()}
     files = write_shaders(program, language, target, told)
+    if language == "glsl" and bundle.network.get("kind") == "perceptron":
+        from deepshade_trainer.shaders.perceptron import write_uniform_shader
+
+        more = write_uniform_shader(bundle, target)
+        typer.echo(
+            f"{more[0]}: the same in one pass; its uniform buffer, {more[-1].name}, has "
+            f"{more[-1].stat().st_size:,} bytes"
+        )
     kernels = Counter(each.kernel for each in program.passes)
     typer.echo(
         f"{target}: {len(files)} files; {len(program.passes)} passes at {size[0]} x {size[1]}, "

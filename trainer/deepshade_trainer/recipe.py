@@ -16,12 +16,18 @@ from deepshade.errors import ConfigError
 from deepshade.files import replacing
 from deepshade.tensors import channel_count, channel_slices
 from deepshade_trainer.losses import parse_loss
-from deepshade_trainer.networks import FoldConfig, NetworkConfig, check_learns, network_config
+from deepshade_trainer.networks import (
+    FoldConfig,
+    NetworkConfig,
+    check_learns,
+    inputs_of,
+    network_config,
+)
 from deepshade_trainer.networks.network import check_types
 
 CHOICES = {
     "effect": tuple(EFFECTS),
-    "optimizer": ("adamw", "adadelta"),
+    "optimizer": ("adamw", "adadelta", "lbfgs"),
     "schedule": ("cosine", "constant"),
     "precision": ("bf16", "fp32"),
 }
@@ -31,11 +37,11 @@ CHOICES = {
 class Recipe:
     """Settings of a run; the defaults are ours.
 
-    `optimizer` is "adamw" or "adadelta"; `schedule` "cosine" (after `warmup` steps) or
-    "constant"; `precision` "bf16" or "fp32"; `ema` the weight average's decay a step (0: none);
-    `clip` bounds the gradient's norm (0: none). `val_fraction` of the scenes are validated on and
-    not trained on. `init_from` is the folder of a run, whose averaged weights to begin with, or of
-    a bundle; where names and shapes agree ("": at random).
+    `optimizer` is "adamw", "adadelta" or, for perceptrons, "lbfgs"; `schedule` "cosine" (after
+    `warmup` steps) or "constant"; `precision` "bf16" or "fp32"; `ema` the weight average's decay a
+    step (0: none); `clip` bounds the gradient's norm (0: none). `val_fraction` of the scenes are
+    validated on and not trained on. `init_from` is the folder of a run, whose averaged weights to
+    begin with, or of a bundle; where names and shapes agree ("": at random).
     """
 
     effect: str = "ao"
@@ -134,12 +140,13 @@ def _channels(effect: Effect, kind: str) -> dict[str, Any]:
     Only positions in effect radii have horizons.
     """
     per_channel = effect.per_channel and kind != "carrier"
+    inputs = inputs_of(kind) or effect.inputs
     found: dict[str, Any] = {
         "kind": kind,
-        "inputs": channel_count(effect.inputs, per_channel),
+        "inputs": channel_count(inputs, per_channel),
         "outputs": 1 if per_channel else len(effect.outputs),
     }
-    places = channel_slices(effect.inputs, per_channel)
+    places = channel_slices(inputs, per_channel)
     geometric = effect.lengths == "radius" and {"normal", "position"} <= places.keys()
     if kind == "fold" and geometric:
         found |= {name: places[name].start for name in ("normal", "position")}

@@ -21,9 +21,11 @@ from deepshade.bundles import CONFIG, Bundle
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade.files import replacing
+from deepshade_trainer import circles
 from deepshade_trainer.dataset import Batch, Dataset, batches
 from deepshade_trainer.losses import parse_loss
 from deepshade_trainer.networks import Network, Shader, build, bundle_weights
+from deepshade_trainer.networks.perceptron import PerceptronConfig
 from deepshade_trainer.recipe import Recipe
 from deepshade_trainer.resident import Resident
 from deepshade_trainer.run import Run
@@ -76,6 +78,11 @@ def train(
         ConfigError: the run was begun with another recipe, or there is no such device.
         DataError: there is too little data, or almost all of it is non-finite.
     """
+    if isinstance(recipe.network, PerceptronConfig):
+        with _finish_on_signals() as stopped:
+            for step, loss, figures in circles.learn(recipe, folders, run, stopped):
+                yield Progress(step, recipe.steps, loss, figures)
+        return
     trainer = _Trainer(recipe, folders, run, device, split, every or Every())
     with _finish_on_signals() as stopped:
         yield from trainer.steps(stopped)
@@ -91,6 +98,8 @@ class _Trainer:
         split: Split | None,
         every: Every,
     ) -> None:
+        if recipe.optimizer == "lbfgs":
+            raise ConfigError("optimizer", detail="lbfgs needs all samples at once: perceptrons'")
         self.recipe, self.run, self.device = recipe, run, _device(device)
         self.every, self.rank, self.world = every, *_place()
         if recipe.batch % self.world:

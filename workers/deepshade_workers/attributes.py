@@ -86,6 +86,24 @@ def _normal(scene: Scene, view: View, hits: Hits) -> Image:
     return np.where(_valid(hits), normal.reshape(3, hits.height, hits.width), 0)
 
 
+def _normal_object(scene: Scene, view: View, hits: Hits) -> Image:
+    """In the space that each object was modelled in; a Mitsuba XML scene's is the world's.
+
+    A normal goes to the world by the inverse transpose of an object's matrix M, and so back by
+    M's transpose.
+    """
+    normal = hits.ns.numpy().astype(np.float64)
+    if any(item.frame for item in scene.objects):
+        number = material(scene, view, hits.surface, hits.valid, "object", 1).numpy()
+        frames = {item.frame for item in scene.objects} - {()}
+        for frame in frames:
+            chosen = np.isin(number, [k for k, o in enumerate(scene.objects) if o.frame == frame])
+            turned = np.reshape(frame, (3, 3)).T @ normal[:, chosen]
+            length = np.linalg.norm(turned, axis=0)
+            normal[:, chosen] = turned / np.maximum(length, 1e-30)
+    return np.where(_valid(hits), normal.reshape(3, hits.height, hits.width), 0)
+
+
 def _material(scene: Scene, view: View, hits: Hits, *, name: str) -> Image:
     start, stop = MATERIAL_CHANNELS[name]
     return np.where(
@@ -115,6 +133,7 @@ def _motion(scene: Scene, view: View, hits: Hits) -> Image:
 _TRACED: dict[str, Callable[[Scene, View, Hits], Image]] = {
     "position": _position,
     "normal": _normal,
+    "normal_object": _normal_object,
     "depth": _depth,
     "motion": _motion,
     **{name: partial(_material, name=name) for name in MATERIAL_CHANNELS},

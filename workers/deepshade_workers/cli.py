@@ -277,6 +277,16 @@ def datagen(
         ),
     ] = None,
     skies: Annotated[int, typer.Option(help="How many different skies.", min=0)] = 64,
+    attributes: Annotated[
+        str,
+        typer.Option(help="Attributes to store beside the effects' inputs: normal_object, say."),
+    ] = "",
+    pixels: Annotated[
+        int,
+        typer.Option(
+            help="Samples are so many pixels of views around each scene, for a perceptron.", min=0
+        ),
+    ] = 0,
     augment: Annotated[
         bool,
         typer.Option(
@@ -307,6 +317,8 @@ def datagen(
       deepshade datagen --out data/env --scenes procedural --effects do,ibl,full \
         --environments maps --views 2048
 
+      deepshade datagen --out data/cat --scenes cat.obj --views 128 --size 512 --pixels 512
+
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
     from deepshade_workers.datagen import DataSpec, default_shard_size, expand_scenes, generate
@@ -331,6 +343,8 @@ def datagen(
         environments=None if environments is None else str(environments),
         skies=skies,
         augment=augment,
+        attributes=tuple(_listed(attributes)),
+        pixels=pixels,
     )
     warn(notes_of(spec.scenes))
     begun = time.monotonic()

@@ -15,6 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from deepshade import symmetry
+from deepshade.attributes import ATTRIBUTES
 from deepshade.effects import EFFECTS
 from deepshade.environments.stored import store, stored_path
 from deepshade.errors import ConfigError, DataError, SceneError
@@ -31,7 +32,7 @@ from deepshade_workers.scenes.loading import (
     parse_procedural,
 )
 from deepshade_workers.scenes.procedural import FAMILIES
-from deepshade_workers.shards import schema, shard_name, write_shard
+from deepshade_workers.shards import circle_schema, schema, shard_name, write_shard
 from deepshade_workers.view import MIN_CONTRAST, Images, Limits, Vector, View
 
 # How often a sample whose scene shows nothing useful may ask for another scene.
@@ -39,7 +40,7 @@ SCENE_TRIES = 16
 STARTS = 3  # of Ray, which gives a busy machine no more than 30 s for one
 MAX_SHARD = 128  # samples
 # Attributes that the camera and the scene's shape alone decide.
-GEOMETRY = {"position", "normal", "normal_world", "depth", "view", "view_angle"}
+GEOMETRY = {"position", "normal", "normal_world", "normal_object", "depth", "view", "view_angle"}
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,9 @@ class DataSpec:
     pictures from the folder `textures` among their textures. Effects under an environment get, for
     each view, a map of the folder `environments` or one of `skies` generated ones, and a rotation.
     With `augment` each view is stored in all turns and mirrors that its effects have (`turns`), and
-    `views` counts it once.
+    `views` counts it once. `attributes` come beside the effects' inputs. With `pixels` a view is
+    seen from a sphere around its scene, and a sample is so many of its pixels with the normals
+    around each (`circles`).
     """
 
     scenes: tuple[str, ...]
@@ -74,10 +77,12 @@ class DataSpec:
     environments: str | None = None
     skies: int = 64
     augment: bool = False
+    attributes: tuple[str, ...] = ()
+    pixels: int = 0
 
     def __post_init__(self) -> None:
         least = {"views": 1, "size": 1, "frame": self.size, "spp": 1, "seed": 0, "shard_size": 1}
-        least["skies"] = 0
+        least["skies"] = least["pixels"] = 0
         for key, low in least.items():
             value = getattr(self, key)
             if value < low:
@@ -91,12 +96,28 @@ class DataSpec:
         if not self.effects:
             raise ConfigError("effects", detail="no effects were given: --effects ao, say")
         require(self.effects)
+        for name in self.attributes:
+            if name not in ATTRIBUTES:
+                raise ConfigError(name, ATTRIBUTES, detail=f"no attribute is called {name!r}")
+        if self.pixels:
+            self._check_pixels()
         if self.environments is not None:
             map_files(self.environments)
         elif self.surrounded and not self.skies:
             raise ConfigError("environments", detail="give --environments, or some --skies")
         if not self.scenes:
             raise ConfigError("scenes", detail="no scenes were given: --scenes procedural, say")
+
+    def _check_pixels(self) -> None:
+        """Raise ConfigError where a few pixels can't tell what is asked for."""
+        seen = {name for effect in self.effects for name in EFFECTS[effect].inputs}
+        if not seen <= GEOMETRY or self.surrounded:
+            raise ConfigError("pixels", detail="--pixels is for effects of geometry alone, as ao")
+        for key in ("augment", "attributes"):
+            if getattr(self, key):
+                raise ConfigError("pixels", detail=f"--pixels and --{key} exclude each other")
+        if self.frame != self.size:
+            raise ConfigError("pixels", detail="--pixels takes whole views: leave --frame out")
 
     @property
     def shards(self) -> int:
@@ -106,6 +127,12 @@ class DataSpec:
     def samples(self, shard: int) -> range:
         """The sample numbers of a shard."""
         return range(shard * self.shard_size, min(self.views, (shard + 1) * self.shard_size))
+
+    def schema(self) -> dict[str, dict[str, Any]]:
+        """What a shard holds (`shards.schema`)."""
+        if self.pixels:
+            return circle_schema(self.effects, self.pixels)
+        return schema(self.effects, self.size, self.attributes)
 
     @property
     def turns(self) -> tuple[int, ...]:
@@ -147,8 +174,13 @@ class DataSpec:
                 del found[key]
         if not self.surrounded:
             del found["environments"], found["skies"]
-        if not self.augment:
-            del found["augment"]
+        for key in ("augment", "pixels"):
+            if not found[key]:
+                del found[key]
+        if self.attributes:
+            found["attributes"] = list(self.attributes)
+        else:
+            del found["attributes"]
         return found
 
 
@@ -218,6 +250,8 @@ def _rendered(
 
     rng = np.random.default_rng([spec.seed, index])
     choice = spec.scenes[index % len(spec.scenes)]
+    if spec.pixels:
+        return _drawn(spec, index, choice, int(rng.integers(2**63)))
     for attempt in range(SCENE_TRIES):
         fresh = is_unseeded(choice)
         name = f"{choice}:{int(rng.integers(2**31))}" if fresh else choice
@@ -249,6 +283,7 @@ def _rendered(
         spec.size,
         spec.size,
         effects=spec.effects,
+        attributes=spec.attributes,
         samples=spec.spp,
         seed=noise,
     )
@@ -256,9 +291,27 @@ def _rendered(
     return images, record, view
 
 
+def _drawn(
+    spec: DataSpec, index: int, name: str, noise: int
+) -> tuple[Images, dict[str, Any], View]:
+    """Some pixels of a view around a scene."""
+    from deepshade_workers.circles import render_circles, view_around
+    from deepshade_workers.records import record_of
+    from deepshade_workers.scenes.loading import open_scene
+
+    if is_unseeded(name):
+        raise ConfigError("pixels", detail=f"--pixels is of one mesh: {name} is many; name a seed")
+    scene = open_scene(name)
+    view = view_around(scene, index // len(spec.scenes), spec.seed, spec.size, spec.radius)
+    images = render_circles(
+        scene, view, spec.size, spec.pixels, effects=spec.effects, samples=spec.spp, seed=noise
+    )
+    return images, {"scene": name, "seed": noise, **record_of(view)}, view
+
+
 def make_shard(spec: DataSpec, index: int, folder: Path, tick: Callable[[], object]) -> Shard:
     """Render and write shard `index`, its environment maps first; `tick` after each sample."""
-    tensors = schema(spec.effects, spec.size)
+    tensors = spec.schema()
     images, records = [], []
     for number in spec.samples(index):
         sample, record, view = _rendered(spec, number)
@@ -281,7 +334,7 @@ def open_manifest(spec: DataSpec, folder: Path) -> Manifest:
     """
     ours = spec.settings()
     if not (folder / NAME).exists():
-        return Manifest(ours, schema(spec.effects, spec.size))
+        return Manifest(ours, spec.schema())
     manifest = Manifest.read(folder)
     theirs = manifest.settings
     differing = [key for key in ours if theirs.get(key) != ours[key]]

@@ -163,6 +163,7 @@ _EMPTY: dict[str, Callable[[Array, Mask], None]] = {
     "position": _position,
     "normal": _vector,
     "normal_world": _vector,
+    "normal_object": _vector,
     "position_world": _vector,
 }
 SURFACE = frozenset(_EMPTY) - {"alpha"}  # quantities that are 0 where there is no surface

@@ -18,7 +18,7 @@ Encoding = Literal["signed", "encoded", "scaled"]
 ENCODINGS: tuple[Encoding, ...] = get_args(Encoding)
 Checks = Literal["usual", "strict", "trust"]
 VECTORS = ("position", "normal", "position_world", "normal_world")
-NORMALS = ("normal", "normal_world")
+NORMALS = ("normal", "normal_world", "normal_object")
 
 Float = NDArray[np.float32]
 

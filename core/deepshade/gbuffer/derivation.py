@@ -18,7 +18,7 @@ from deepshade.camera import Camera, rotation_of
 from deepshade.gbuffer.geometry import normals_from_positions, unit
 
 Array = NDArray[np.float32]
-Requirement = Literal["fov", "matrix", "lens"]
+Requirement = Literal["fov", "matrix", "lens", "unmoved"]
 
 _PIECE = 2**13  # pixels transformed at a time
 
@@ -26,6 +26,7 @@ _REQUIREMENTS: dict[Requirement, str] = {
     "fov": "the field of view (--fov)",
     "matrix": "the camera's matrix (worldToCamera)",
     "lens": "the field of view and the lens (deepshade:focus and deepshade:aperture)",
+    "unmoved": "objects that were never moved (deepshade:unmoved)",
 }
 REQUIREMENT_FIXES: dict[Requirement, str] = {
     "fov": "give the full horizontal angle in degrees (--fov), or write deepshade:fov; of a camera "
@@ -33,6 +34,8 @@ REQUIREMENT_FIXES: dict[Requirement, str] = {
     "matrix": "give it (--world-to-camera), or write the standard header attribute worldToCamera",
     "lens": "give the full horizontal angle, the focus distance and the aperture's diameter, or "
     "write deepshade:fov, deepshade:focus and deepshade:aperture",
+    "unmoved": "where all objects are placed and turned as they were modelled, object space is "
+    "world space: write deepshade:unmoved 1 (--map normal_object=<layer> says so too)",
 }
 
 
@@ -150,6 +153,13 @@ _TABLE = (
         lambda s: _turned(rotation_of(s.world_to_camera).T, s.arrays["normal"]),
         "from camera-space normals and worldToCamera",
     ),
+    Derivation(
+        "normal_object",
+        ("normal_world",),
+        "unmoved",
+        lambda s: s.arrays["normal_world"].copy(),
+        "world-space normals, of objects that were never moved",
+    ),
     Derivation("view", ("position",), "matrix", _view, "from position and worldToCamera"),
     Derivation(
         "view_angle",
@@ -179,7 +189,7 @@ def plan(
 ) -> list[Derivation] | None:
     """The steps, in order, that lead from `have` to `target`; [] if it is there, None if none.
 
-    `met` holds the requirements that the header fulfils: "fov", "matrix", "lens".
+    `met` holds the requirements that the header fulfils: "fov", "matrix", "lens", "unmoved".
     """
     if target in have:
         return []
@@ -227,7 +237,9 @@ def requirements(
     """Which requirements the camera and header fulfil."""
     pinhole = camera is not None and camera.projection == "perspective"
     lens = pinhole and lens_of(header) is not None
+    unmoved = str(header.get("deepshade:unmoved", "")) in ("1", "1.0")
     there = {"fov": camera is not None, "matrix": matrix is not None, "lens": lens}
+    there["unmoved"] = unmoved
     return {name for name in _REQUIREMENTS if there[name]}
 
 

@@ -34,8 +34,8 @@ def check_surfaces(e: Examination) -> None:
     source, kinds = place
     for name in NORMALS:
         if name in e.used and name in e.stored:
-            if name == "normal_world" and e.matrix is None:
-                continue
+            if name == "normal_object" or (name == "normal_world" and e.matrix is None):
+                continue  # nobody knows how it is turned to the camera
             if not _together(e, name, source, kinds):
                 return
 

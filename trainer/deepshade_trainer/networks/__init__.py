@@ -21,6 +21,7 @@ from deepshade_trainer.networks.lens import Lens, LensConfig
 from deepshade_trainer.networks.network import Network
 from deepshade_trainer.networks.openings import Openings, OpeningsConfig
 from deepshade_trainer.networks.paper_unet import PaperConfig, PaperUNet
+from deepshade_trainer.networks.perceptron import Perceptron, PerceptronConfig
 from deepshade_trainer.networks.reflections import Reflections, ReflectionsConfig
 from deepshade_trainer.networks.shader import Shader
 
@@ -33,6 +34,7 @@ __all__ = [
     "bundle_weights",
     "check_learns",
     "from_bundle",
+    "inputs_of",
     "network_config",
 ]
 
@@ -44,6 +46,7 @@ NetworkConfig = (
     | LensConfig
     | OpeningsConfig
     | PaperConfig
+    | PerceptronConfig
     | ReflectionsConfig
 )
 
@@ -55,6 +58,7 @@ _KINDS: dict[str, tuple[Any, Any]] = {
     "lens": (LensConfig, Lens),
     "openings": (OpeningsConfig, Openings),
     "paper": (PaperConfig, PaperUNet),
+    "perceptron": (PerceptronConfig, Perceptron),
     "reflections": (ReflectionsConfig, Reflections),
 }
 
@@ -105,6 +109,12 @@ def network_config(settings: Mapping[str, Any], base: NetworkConfig | None = Non
         for k, v in settings.items()
     }
     return dataclasses.replace(base, **values)
+
+
+def inputs_of(kind: str) -> tuple[str, ...]:
+    """The attributes that networks of a kind see, where they are other than the effect's."""
+    found: tuple[str, ...] = _KINDS[kind][1].attributes if kind in _KINDS else ()
+    return found
 
 
 def from_bundle(path: Path | str) -> Shader:

@@ -29,6 +29,8 @@ class Network(nn.Module, ABC):
     rounded: str | None = ""
     # Whether nothing of it is learnt, but for what it takes over, frozen, from another network.
     calculated = False
+    # What it sees, where that is something else than the effect's inputs.
+    attributes: tuple[str, ...] = ()
     # What it is given of an environment beside the G-buffer: names in `environments.INPUTS`.
     environment: tuple[str, ...] = ()
 

@@ -31,14 +31,15 @@ class Shader(nn.Module):
         self.effect, self.network = effect, network
         self.transfer = "linear" if network.linear else effect.transfer
         self.per_channel = effect.per_channel and not network.linear
-        self.places = channel_slices(effect.inputs, self.per_channel)
+        self.inputs = network.attributes or effect.inputs
+        self.places = channel_slices(self.inputs, self.per_channel)
         self.lights = [
-            self.places[name] for name in effect.inputs if ATTRIBUTES[name].unit is RADIANCE
+            self.places[name] for name in self.inputs if ATTRIBUTES[name].unit is RADIANCE
         ]
         self.background: float | None = None  # on the curve
         if isinstance(effect.background, float):
             self.background = float(self.curve(torch.tensor(effect.background)))
-            if not {"position", "depth"} & set(effect.inputs):
+            if not {"position", "depth", "normal_object"} & set(self.inputs):
                 raise ConfigError(
                     effect.name, detail=f"no input of '{effect.name}' says where background is"
                 )
@@ -136,7 +137,10 @@ class Shader(nn.Module):
         if "position" in self.places:
             last = self.places["position"].stop
             return covered(gbuffer[:, last - 1 : last])
-        return covered(-gbuffer[:, self.places["depth"]])
+        if "depth" in self.places:
+            return covered(-gbuffer[:, self.places["depth"]])
+        normal = gbuffer[:, self.places["normal_object"]]
+        return covered(-(normal * normal).sum(1, keepdim=True))
 
 
 def _bent(image: Tensor) -> Tensor:

@@ -28,5 +28,14 @@ PRESETS = {
             "bias": _BIAS,
         }
     },
+    **{
+        f"mlp-{a}x{b}": {
+            "network": {"kind": "perceptron", "widths": (a, b)},
+            "loss": "l2",
+            "optimizer": "lbfgs",
+            "steps": 80,  # of ten iterations each
+        }
+        for a, b in ((16, 8), (32, 16), (64, 32))
+    },
     **paper({"kind": "paper", "u0": 8, "levels": 6}),
 }

@@ -60,6 +60,7 @@ def compose(parts: str, files: tuple[Path, ...], load: Callable[[Path], Mesh], s
     half = float(np.sqrt(count)) * rng.uniform(0.55, 0.9)  # of the floor's side
     placed: list[Mesh] = []
     names: list[str] = []
+    frames: list[Floats] = []
     taken = np.zeros((0, 3))
     for number, kind in enumerate(chosen):
         size = rng.uniform(0.8, 1.25)
@@ -70,10 +71,12 @@ def compose(parts: str, files: tuple[Path, ...], load: Callable[[Path], Mesh], s
         spot = _free_spot(rng, half, reach, taken)
         taken = np.concatenate([taken, [[*spot, reach]]])
         angle = float(rng.choice([0, 0.5, 1, 1.5, rng.uniform(0, 2)])) * np.pi
-        placed.append(solid.transformed(place((spot[0], 0, spot[1]), size, turn_y(angle))))
+        frames.append(place((spot[0], 0, spot[1]), size, turn_y(angle)))
+        placed.append(solid.transformed(frames[-1]))
         names.append(f"{files[kind].stem} {number}")
     shell = _shell(rng, half + 0.4)
-    return merge([*placed, *shell.values()], [*names, *shell])
+    frames += [np.eye(4)] * len(shell)
+    return merge([*placed, *shell.values()], [*names, *shell], frames)
 
 
 def _standing(mesh: Mesh) -> Mesh:

@@ -81,7 +81,7 @@ def load_gltf(path: Path) -> Mesh:
         )
 
     worlds = _worlds(content.get("nodes", []))
-    parts, names = [], []
+    parts, names, frames = [], [], []
     taken: set[str] = set()
     for index in _shown(content):
         node = content["nodes"][index]
@@ -98,9 +98,10 @@ def load_gltf(path: Path) -> Mesh:
             if part is not None and len(part.faces):
                 parts.append(part)
                 names.append(name)
+                frames.append(np.eye(4) if "skin" in node else worlds[index])
     if not parts:
         raise SceneError(f"{path} holds no triangles")
-    merged = merge(parts, names)
+    merged = merge(parts, names, frames)
     return replace(merged, notes=tuple(document.resources.notes))
 
 

@@ -31,11 +31,16 @@ class Material:
 
 
 class Object(NamedTuple):
-    """A part of a mesh that moves as one: its faces are `start` to `stop` - 1."""
+    """A part of a mesh that moves as one: its faces are `start` to `stop` - 1.
+
+    `frame` are the nine numbers, row by row, of the matrix that brings directions of the space
+    that it was modelled in to the world; () where that is the world's.
+    """
 
     name: str
     start: int
     stop: int
+    frame: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -159,19 +164,21 @@ class Mesh:
         return replace(self, faces=self.faces[:, ::-1], normals=self.normals[:, ::-1], paint=paint)
 
 
-def merge(meshes: Iterable[Mesh], names: Sequence[str] = ()) -> Mesh:
+def merge(meshes: Iterable[Mesh], names: Sequence[str] = (), frames: Sequence[Floats] = ()) -> Mesh:
     """One mesh of all, so that a ray tracer sees a single shape.
 
     `names`, one for each mesh, say which objects they belong to: neighbours of equal name are one.
+    `frames` (4, 4) or (3, 3), one for each, have brought them to the world (`Object.frame`).
     """
     parts = list(meshes)
     ends = np.cumsum([len(part.faces) for part in parts])
     objects: list[Object] = []
-    for name, part, end in zip(names, parts, ends.tolist(), strict=bool(names)):
+    turned = [_frame(each) for each in frames] or [()] * len(names)
+    for name, part, end, own in zip(names, parts, ends.tolist(), turned, strict=bool(names)):
         start = end - len(part.faces)
         if objects and objects[-1].name == name:
-            start = objects.pop().start
-        objects.append(Object(name, start, end))
+            start, own = objects[-1].start, objects.pop().frame
+        objects.append(Object(name, start, end, own))
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -182,6 +189,12 @@ def merge(meshes: Iterable[Mesh], names: Sequence[str] = ()) -> Mesh:
         _merged_paint(parts),
         tuple(dict.fromkeys(note for part in parts for note in part.notes)),
     )
+
+
+def _frame(matrix: Floats) -> tuple[float, ...]:
+    """What directions are turned by; () for nothing."""
+    linear = matrix[:3, :3]
+    return () if np.array_equal(linear, np.eye(3)) else tuple(linear.ravel().tolist())
 
 
 def _merged_paint(parts: Sequence[Mesh]) -> Paint | None:

@@ -30,16 +30,17 @@ def load_plain(path: Path) -> Mesh:
         loaded, surfaces = load_obj(path, resources)
     else:
         loaded = trimesh.load_scene(path, process=False)
-    found = {}
+    found, frames = {}, []
     for node in loaded.graph.nodes_geometry:
         matrix, name = loaded.graph[node]
         part = loaded.geometry[name]
         if isinstance(part, trimesh.Trimesh) and len(part.faces):
             mesh = _convert(part, surfaces, path, resources)
-            found[node] = mesh.transformed(np.asarray(matrix, np.float64))
+            frames.append(np.asarray(matrix, np.float64))
+            found[node] = mesh.transformed(frames[-1])
     if not found:
         return Mesh.build(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
-    return replace(merge(found.values(), list(found)), notes=tuple(resources.notes))
+    return replace(merge(found.values(), list(found), frames), notes=tuple(resources.notes))
 
 
 def _convert(part: Any, surfaces: Mapping[str, Surface], path: Path, resources: Resources) -> Mesh:
