@@ -28,8 +28,8 @@ from deepshade_trainer.takers import Taker, takers
 
 OPSETS = range(13, 19)
 LICENCE = "Apache-2.0"
-# Between the graph and the bundle's own, of values up to 1, or of the value: `do` divides by what is
-# blocked, and strays by 3e-6 in a few pixels of noise, the others by 1e-6. With fp16 on average:
+# Between the graph and the bundle's own, of values up to 1, or of the value: `do` divides by what
+# is blocked and strays by 3e-6 in a few pixels of noise, the others by 1e-6. With fp16 on average:
 # on noise, which has no surfaces, single pixels flip.
 TOLERANCES = {"fp32": 4e-6, "fp16": 2e-3}
 _FREE_SIDE = 128  # of the picture that a graph of any size is compared on
