@@ -15,6 +15,7 @@ from deepshade.errors import CameraError
 
 _STRIDE = 4  # every how many pixels normals are compared
 _FLAT = 1e-3  # share of a singular value that is rounding
+LEAST_FOV = 1e-6  # degrees; of less a pixel spans nothing in float32
 Window = tuple[int, int, int, int]
 Projection = Literal["perspective", "orthographic", "latlong"]
 PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
@@ -62,10 +63,10 @@ class Camera:
                     fix="give its width in scene units: --ortho-width 10",
                 )
         elif self.projection == "perspective" and not (
-            math.isfinite(self.fov) and 0.0 < self.fov < 180.0
+            math.isfinite(self.fov) and LEAST_FOV <= self.fov < 180.0
         ):
             raise CameraError(
-                f"the field of view is {self.fov}°, it must lie between 0 and 180",
+                f"the field of view is {self.fov}°, it must lie between {LEAST_FOV} and 180",
                 fix="give the full horizontal angle in degrees: --fov 50",
             )
         if self.width < 1 or self.height < 1:

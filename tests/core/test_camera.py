@@ -54,7 +54,7 @@ def test_look_at_straight_down_still_works():
     np.testing.assert_allclose(linear @ linear.T, np.eye(3), atol=1e-12)
 
 
-@pytest.mark.parametrize("fov", [0, 180, -5, math.nan, math.inf])
+@pytest.mark.parametrize("fov", [0, 5e-324, 180, -5, math.nan, math.inf])
 def test_refuses_impossible_angles(fov):
     with pytest.raises(CameraError):
         Camera(fov, 8, 8)
