@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import io
 import os
 import re
@@ -240,7 +241,11 @@ class Local:
         self.client.close()
         self._server.should_exit = True
         self._thread.join(30)
-        assert not self._thread.is_alive()
+        if self._thread.is_alive():
+            for task in asyncio.all_tasks(self.loop):
+                task.print_stack()
+            faulthandler.dump_traceback()
+            raise AssertionError("the service doesn't end: see the tasks and threads above")
 
 
 @pytest.fixture(scope="session")

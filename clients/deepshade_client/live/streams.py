@@ -7,7 +7,7 @@ import queue
 import secrets
 import threading
 from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
-from contextlib import suppress
+from contextlib import aclosing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,9 @@ async def stream(
     publisher = Publisher(server, name, names, settings, every=every, **more)
     feeding = asyncio.ensure_future(_feed(publisher, pictures, options))
     try:
-        async for answer in publisher.answers():
-            yield answer
+        async with aclosing(publisher.answers()) as answers:
+            async for answer in answers:
+                yield answer
         if feeding.done():
             feeding.result()
     finally:
@@ -56,14 +57,16 @@ def stream_sync(
     stopping = threading.Event()
 
     async def run() -> None:
-        async for answer in stream(server, effects, pictures, options, **more):
-            while not stopping.is_set():
-                with suppress(queue.Full):
-                    ready.put_nowait(answer)
-                    break
-                await asyncio.sleep(0.002)
-            if stopping.is_set():
-                return
+        # closed here, while the loop runs: else its end may cut off the connection's
+        async with aclosing(stream(server, effects, pictures, options, **more)) as answers:
+            async for answer in answers:
+                while not stopping.is_set():
+                    with suppress(queue.Full):
+                        ready.put_nowait(answer)
+                        break
+                    await asyncio.sleep(0.002)
+                if stopping.is_set():
+                    return
 
     def work() -> None:
         end: BaseException | None = None

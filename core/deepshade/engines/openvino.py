@@ -59,8 +59,9 @@ class OpenVino(Engine):
 
     def __init__(self, bundle: Bundle, backend: Backend, *, threads: int) -> None:
         super().__init__(bundle, backend, threads=threads)
-        # What 8 bits leave out runs in the CPU's own 16 bits, if it has them.
-        in_16_bits = backend.precision != "fp32" and "bf16" in precisions()
+        # What 8 bits leave out runs in the CPU's own 16 bits, if it has them; but where a graph
+        # doesn't say what has to be exact, all is.
+        in_16_bits = backend.precision != "fp32" and "bf16" in precisions() and bundle.float32
         self._type = "bf16" if in_16_bits else "f32"
         try:
             self._model = _core().read_model(str(bundle.model))
