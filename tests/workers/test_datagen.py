@@ -6,18 +6,20 @@ import contextlib
 import json
 import os
 import secrets
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from safetensors.numpy import load_file
 
 from deepshade import exr, symmetry
@@ -297,9 +299,29 @@ def wait_for(condition: Any, seconds: float = 240) -> Any:
     raise AssertionError("waited in vain")
 
 
+@dataclass(frozen=True)
+class Cluster:
+    """A running cluster: its process, its head's and its dashboard's port, and the environment of
+    its jobs."""
+
+    pid: int
+    port: int
+    dashboard: int
+    environment: dict[str, str]
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports of 127.0.0.1 at which nobody listens now."""
+    with contextlib.ExitStack() as stack:
+        sockets = [
+            stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)
+        ]
+        return [each.getsockname()[1] for each in sockets]
+
+
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: Any) -> Iterator[tuple[int, dict[str, str]]]:
-    """A running cluster that wants a token: its process, and the environment of its jobs."""
+def cluster(tmp_path_factory: Any) -> Iterator[Cluster]:
+    """One that wants a token."""
     environment = {
         **os.environ,
         "RAY_USAGE_STATS_ENABLED": "0",
@@ -308,31 +330,40 @@ def cluster(tmp_path_factory: Any) -> Iterator[tuple[int, dict[str, str]]]:
         "PATH": path_with_venv(),
     }
     environment.pop("RAY_ADDRESS", None)
-    ports = ["--port=9379", "--dashboard-port=9265", "--num-cpus=2"]
-    ports += ["--dashboard-agent-listen-port=9266"]
+    head, dashboard, agent, clients = free_ports(4)
+    ports = [f"--port={head}", f"--dashboard-port={dashboard}", "--num-cpus=2"]
+    ports += [f"--dashboard-agent-listen-port={agent}", f"--ray-client-server-port={clients}"]
     ray = str(Path(sys.executable).with_name("ray"))
     start = [ray, "start", "--head", "--block", "--include-dashboard=true", *ports]
     log = tmp_path_factory.mktemp("cluster") / "ray.log"
     with log.open("w") as out, running(start, env=environment, stderr=out) as process:
         try:
-            wait_for(lambda: process.poll() is None and answers_at(9265))
+            wait_for(lambda: process.poll() is None and answers_at(dashboard))
         except AssertionError:
             raise AssertionError(f"no cluster: {log.read_text()}") from None
-        yield process.pid, environment
+        yield Cluster(process.pid, head, dashboard, environment)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_cluster_takes_a_submitted_job(
-    tmp_path: Path, expected: dict[str, str], cluster: tuple[int, dict[str, str]]
+    tmp_path: Path, expected: dict[str, str], cluster: Cluster
 ) -> None:
     """As `ray job submit -- deepshade datagen`."""
     ray, answers = str(Path(sys.executable).with_name("ray")), []
 
     def submit(*arguments: str) -> bool:
         done = subprocess.run(
-            [ray, "job", "submit", "--address", "http://127.0.0.1:9265", "--", *arguments],
-            env=cluster[1],
+            [
+                ray,
+                "job",
+                "submit",
+                "--address",
+                f"http://127.0.0.1:{cluster.dashboard}",
+                "--",
+                *arguments,
+            ],
+            env=cluster.environment,
             capture_output=True,
             timeout=240,
         )
@@ -346,25 +377,90 @@ def test_a_cluster_takes_a_submitted_job(
     check(tmp_path / "job", expected)
 
 
+@contextlib.contextmanager
+def sshd(folder: Path) -> Iterator[tuple[Path, str]]:
+    """An SSH server of our own, where `folder` is home: the key that it takes, how to reach it."""
+    program = shutil.which("sshd") or "/usr/sbin/sshd"
+    if os.geteuid() or not all(map(shutil.which, (program, "ssh", "rsync", "nc"))):
+        pytest.skip("needs root, sshd, ssh, rsync and nc")
+    Path("/run/sshd").mkdir(exist_ok=True)
+    folder.mkdir()
+    for key in ("host", "user"):
+        subprocess.run(
+            ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", folder / key], check=True
+        )
+    (folder / "authorized").write_text((folder / "user.pub").read_text())
+    (port,) = free_ports(1)
+    options = {
+        "ListenAddress": f"127.0.0.1:{port}",
+        "HostKey": folder / "host",
+        "AuthorizedKeysFile": folder / "authorized",
+        "PidFile": "none",
+        "StrictModes": "no",
+        "PermitRootLogin": "prohibit-password",
+        "SetEnv": f"HOME={folder}",
+    }
+    words = [word for name, value in options.items() for word in ("-o", f"{name}={value}")]
+    with running([program, "-D", "-f", "/dev/null", *words]):
+        wait_for(lambda: answers_at(port), 30)
+        yield folder / "user", f"nc 127.0.0.1 {port}"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_cluster_takes_a_script_over_ssh(
+    tmp_path: Path, expected: dict[str, str], cluster: Cluster
+) -> None:
+    """As `ray submit examples/cluster.yaml`, on one machine where Ray runs already."""
+    ray = str(Path(sys.executable).with_name("ray"))
+    with sshd(tmp_path / "home") as (key, proxy):
+        config = yaml.safe_load((ROOT / "examples/cluster.yaml").read_text())
+        config |= {"cluster_name": f"deepshade-{secrets.token_hex(4)}", "file_mounts": {}}
+        config |= {"min_workers": 0, "max_workers": 0, "head_start_ray_commands": []}
+        config["provider"] |= {"head_ip": "127.0.0.1", "worker_ips": []}
+        config["auth"] = {
+            "ssh_user": "root",
+            "ssh_private_key": str(key),
+            "ssh_proxy_command": proxy,
+        }
+        said = {name: cluster.environment[name] for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN")}
+        said |= {"PATH": f"{DEEPSHADE.parent}:$PATH", "RAY_ADDRESS": f"127.0.0.1:{cluster.port}"}
+        exports = " ".join(f"{name}={value}" for name, value in said.items())
+        config["setup_commands"] = [f"echo 'export {exports}' >> ~/.bashrc"]
+        path = tmp_path / "cluster.yaml"
+        path.write_text(yaml.safe_dump(config))
+        script = str(ROOT / "scripts/ray_datagen.py")
+        for words in (
+            ["up", "-y", str(path)],
+            ["submit", str(path), script, *command(tmp_path / "out")],
+        ):
+            done = subprocess.run(
+                [ray, *words], capture_output=True, text=True, timeout=300, env=cluster.environment
+            )
+            assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    check(tmp_path / "out", expected)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_killed_job_goes_on_and_a_killed_worker_costs_nothing_but_time(
-    tmp_path: Path, expected: dict[str, str], cluster: tuple[int, dict[str, str]]
+    tmp_path: Path, expected: dict[str, str], cluster: Cluster
 ) -> None:
     """As a script, then with --address. What Ray says of the dead is no JSON."""
+    address = f"127.0.0.1:{cluster.port}"
     script = [sys.executable, str(ROOT / "scripts/ray_datagen.py"), *command(tmp_path)]
-    with running(script, env={**cluster[1], "RAY_ADDRESS": "127.0.0.1:9379"}) as process:
+    with running(script, env={**cluster.environment, "RAY_ADDRESS": address}) as process:
         wait_for(lambda: list(tmp_path.glob("shard-*")))
         os.killpg(process.pid, signal.SIGKILL)
     # What a kill in the middle of a write leaves, and a shard that was damaged later:
     (tmp_path / ".shard-00003.safetensors.0badcafe.tmp").write_bytes(b"half")
     complete = next(iter(sorted(tmp_path.glob("shard-*"))))
     complete.write_bytes(complete.read_bytes()[:-8])
-    job = [str(DEEPSHADE), "datagen", *command(tmp_path), "--address", "127.0.0.1:9379"]
+    job = [str(DEEPSHADE), "datagen", *command(tmp_path), "--address", address]
     with (tmp_path.parent / "summary.json").open("w+") as printed:
-        with running(job, stdout=printed, env=cluster[1]) as process:
+        with running(job, stdout=printed, env=cluster.environment) as process:
             for name in ("ray::_shard_task", "ray::Tally"):
-                os.kill(wait_for(lambda name=name: workers(cluster[0], name))[0], signal.SIGKILL)
+                os.kill(wait_for(lambda name=name: workers(cluster.pid, name))[0], signal.SIGKILL)
             assert process.wait(300) == 0
         printed.seek(0)
         assert json.load(printed)["views"] == 12

@@ -62,6 +62,7 @@ def finetune(plan: Plan, folder: Path) -> Iterator[Event]:
     if written.exists():  # it comes last: all else is there
         yield {"phase": "judged", "decision": json.loads(written.read_text())}
         return
+    folder.mkdir(parents=True, exist_ok=True)
     parts = own_parts(plan)
     recipe = yield from _recipe(plan, folder)
     run = Run(folder / "run")
