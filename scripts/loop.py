@@ -1,11 +1,13 @@
 """The whole loop on docker-compose.yml's services, without a container engine.
 
     sudo python scripts/loop.py --small        # minutes; without --small a quarter of an hour
+    sudo python scripts/loop.py --scene scenes/living_room.gltf
 
-Services up with new tokens; `ray job submit -- deepshade datagen` renders views of one scene; the
-trainer fine-tunes ambient occlusion to them and publishes it; the shading service answers with
-the new version, and after a rollback with the old; all down. Says what it does and how long it
-took, and ends with 1 where anything is otherwise. `--images` takes roots of scripts/images.py.
+Services up with new tokens; `ray job submit -- deepshade datagen` renders views of one scene, a
+procedural one or a file, whose folder is copied; the trainer fine-tunes ambient occlusion to them
+and publishes it; the shading service answers with the new version, and after a rollback with the
+old; all down. Says what it does and how long it took, and ends with 1 where anything is otherwise.
+`--images` takes roots of scripts/images.py.
 """
 
 from __future__ import annotations
@@ -78,12 +80,12 @@ def shaded(topology: Topology) -> tuple[str, bytes]:
     return answer.headers["Deepshade-Bundle-Sha256"], answer.content
 
 
-def render(topology: Topology, size: Size) -> None:
-    """Have Ray render a data set into the volume `shards`."""
+def render(topology: Topology, size: Size, scene: str = SCENE) -> None:
+    """Have Ray render a data set of a scene, as its workers see it, into the volume `shards`."""
     topology.execute(
         "ray-head",
         *("ray", "job", "submit", "--address", "http://127.0.0.1:8265", "--"),
-        *("deepshade", "datagen", "--out", "/shards/mine", "--scenes", SCENE),
+        *("deepshade", "datagen", "--out", "/shards/mine", "--scenes", scene),
         *("--views", str(size.views), "--size", str(size.pixels), "--spp", str(size.rays)),
     )
 
@@ -101,13 +103,24 @@ def tune(topology: Topology, size: Size) -> Any:
     return client(topology, "train", "ao", "--data", "mine", *size.training)
 
 
-def loop(topology: Topology, size: Size) -> None:
+def within(topology: Topology, scene: str) -> str:
+    """A scene's name in the containers; a file's folder is copied to the volume `shards`."""
+    path = Path(scene)
+    if not path.is_file():
+        return scene
+    folder = topology.volume("shards") / "scene"
+    shutil.copytree(path.parent, folder, copy_function=shutil.copyfile)
+    subprocess.run(["chmod", "-R", "a+rX", folder], check=True)
+    return f"/shards/scene/{path.name}"
+
+
+def loop(topology: Topology, size: Size, scene: str = SCENE) -> None:
     """Once around. Raises RuntimeError where something isn't as it should be."""
     with step(f"up: {', '.join(SERVICES)}"):
         topology.up(*SERVICES)
     first, _ = shaded(topology)
-    with step(f"ray job submit: {size.views} views of {SCENE}"):
-        render(topology, size)
+    with step(f"ray job submit: {size.views} views of {scene}"):
+        render(topology, size, within(topology, scene))
     with step("train"):
         job = tune(topology, size)
     print(f"  {job['sentence']}")
@@ -132,6 +145,7 @@ def main() -> int:
     )
     parser.add_argument("--small", action="store_true")
     parser.add_argument("--out", type=Path, default=ROOT / "out/loop", help="is emptied first")
+    parser.add_argument("--scene", default=SCENE)
     parser.add_argument("--images", type=Path)
     asked = parser.parse_args()
     if not permitted():
@@ -139,7 +153,7 @@ def main() -> int:
         return 2
     try:
         with Topology(prepare(asked.out), asked.out, asked.images) as topology:
-            loop(topology, SMALL if asked.small else WHOLE)
+            loop(topology, SMALL if asked.small else WHOLE, asked.scene)
     except (RuntimeError, httpx.HTTPError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -45,10 +46,13 @@ RATE = 8e-4  # of 2e-3, from which networks begin: what a base knows is kept, an
 EMA = 0.95
 PILOT = 4  # steps, of which the first is not timed
 USED = 0.85  # of the minutes are steps; the rest is for validation and saving
+# How often a view of one's own is learnt from at most, however quick the machine. Of 56 views of a
+# room, others of it had 28 % less error after 64 times, and 18 % after 264.
+EPOCHS = 64
 # How far from the base to the tuned weights, the farthest first, and how much of what a test may
 # lose the reminders may.
 BLENDS = (1.0, 0.8, 0.6, 0.4, 0.2)
-MARGIN = 0.5
+MARGIN = 0.35
 ROUNDS = 7  # of timing
 
 
@@ -64,7 +68,7 @@ def finetune(plan: Plan, folder: Path) -> Iterator[Event]:
         return
     folder.mkdir(parents=True, exist_ok=True)
     parts = own_parts(plan)
-    recipe = yield from _recipe(plan, folder)
+    recipe = yield from _recipe(plan, folder, parts)
     run = Run(folder / "run")
     if plan.processes > 1:
         yield from train_together(plan, recipe, run)
@@ -94,7 +98,7 @@ def finetune(plan: Plan, folder: Path) -> Iterator[Event]:
     yield {"phase": "judged", "decision": decision}
 
 
-def _recipe(plan: Plan, folder: Path) -> Any:
+def _recipe(plan: Plan, folder: Path, parts: Parts) -> Any:
     """The recipe; its number of steps is measured once for a job, and then stays."""
     recipe = base_recipe(plan)
     if plan.steps:
@@ -104,6 +108,8 @@ def _recipe(plan: Plan, folder: Path) -> Any:
         yield {"phase": "timing"}
         seconds = _pilot(plan, recipe)
         steps = max(1, int(USED * 60 * plan.minutes / seconds))
+        own = (1 - plan.share) * recipe.batch if parts.rehearsed else recipe.batch
+        steps = min(steps, math.ceil(EPOCHS * len(parts.learnt) / own))
         with replacing(path) as temporary:
             temporary.write_text(json.dumps({"steps": steps, "seconds": seconds}))
     steps = int(json.loads(path.read_text())["steps"])

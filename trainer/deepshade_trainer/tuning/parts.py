@@ -11,7 +11,7 @@ from deepshade.errors import DataError
 from deepshade_trainer.dataset import Dataset
 
 # Of the views: what share judges, and at least how many must, for an interval to mean something.
-JUDGES = 1 / 8
+JUDGES = 1 / 4
 MIN_JUDGES = 4
 
 
@@ -55,7 +55,7 @@ class Parts:
 
 
 def _split(data: Dataset, numbers: Sequence[int], seed: int) -> tuple[list[int], list[int]]:
-    """Numbers to learn from, and the eighth (at least `MIN_JUDGES` views) that isn't."""
+    """Numbers to learn from, and the quarter (at least `MIN_JUDGES` views) that isn't."""
     views: dict[str, list[int]] = {}
     for number in numbers:
         record = data.entries[number].record
