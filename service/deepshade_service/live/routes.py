@@ -112,7 +112,7 @@ async def _publish(connection: Connection, name: str, service: Service, sessions
     asking = reader.read(hello)
     want = _wanted(hello)
     session = sessions.open(name, hello.get("resume"))
-    replaced, ended = session.replaced, False
+    replaced = session.replaced
     try:
         limits = service.settings.limits
         await connection.say(
@@ -138,7 +138,7 @@ async def _publish(connection: Connection, name: str, service: Service, sessions
         sides = connection.say, outlet, want, history
         pipeline = Pipeline(service.shader, service.telemetry, session, reader, *sides)
         listening = _listen(connection, messages, session, pipeline, service)
-        ended = await _until_first_ends(
+        await _until_first_ends(
             listening,
             pipeline.run(),
             connection.compare_clocks(),
@@ -146,8 +146,8 @@ async def _publish(connection: Connection, name: str, service: Service, sessions
             replaced.wait(),
         )
     finally:
-        if not replaced.is_set():
-            sessions.leave(session, ended=ended is True)
+        if not (replaced.is_set() or session.ended.is_set()):
+            sessions.leave(session)
 
 
 async def _listen(
@@ -156,8 +156,8 @@ async def _listen(
     session: Session,
     pipeline: Pipeline,
     service: Service,
-) -> bool:
-    """Take frames until the publisher leaves; whether it said that this is the end."""
+) -> None:
+    """Take frames until the publisher leaves. If it says that this is the end, the session ends."""
     allowed, at = float(service.settings.live_rate), time.monotonic()
     async for message in messages:
         if isinstance(message, bytes):
@@ -176,8 +176,9 @@ async def _listen(
                 raise live.FrameError(f"a publisher sends kind {live.GBUFFER}, not {frame.kind}")
             pipeline.offer(frame, source_time(frame, connection.ahead))
         elif message["type"] == "end":
-            return True
-    return False
+            # at once, not when what is inferred is done: who comes next may want the name
+            service.sessions.end(session)
+            return
 
 
 async def _view(connection: Connection, session: Session) -> None:

@@ -196,7 +196,7 @@ class Sessions:
             there.replaced = asyncio.Event()
             return there
         if len(self._sessions) >= self._settings.live_sessions and self._leaving:
-            self._end(self._sessions[next(iter(self._leaving))])  # gone for longest
+            self.end(self._sessions[next(iter(self._leaving))])  # gone for longest
         if len(self._sessions) >= self._settings.live_sessions:
             raise Problem(
                 429,
@@ -207,26 +207,24 @@ class Sessions:
         self._sessions[name] = Session(name, self._settings.live_viewers)
         return self._sessions[name]
 
-    def leave(self, session: Session, *, ended: bool) -> None:
-        """Its publisher has gone; if it didn't say that this is the end, it is waited for."""
+    def leave(self, session: Session) -> None:
+        """Its publisher has gone without saying that this is the end: it is waited for."""
         session.publisher = "gone"
-        if ended:
-            self._end(session)
-            return
         self._stay(session.name)
         loop = asyncio.get_running_loop()
-        self._leaving[session.name] = loop.call_later(GRACE, self._end, session)
+        self._leaving[session.name] = loop.call_later(GRACE, self.end, session)
 
     def stop(self) -> None:
         """Forget all."""
         for session in self.all():
-            self._end(session)
+            self.end(session)
 
     def _stay(self, name: str) -> None:
         with suppress(KeyError):
             self._leaving.pop(name).cancel()
 
-    def _end(self, session: Session) -> None:
+    def end(self, session: Session) -> None:
+        """Its name is free."""
         self._stay(session.name)
         if self._sessions.get(session.name) is session:
             del self._sessions[session.name]
