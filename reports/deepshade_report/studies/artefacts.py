@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from deepshade.pictures import difference, normals, shading
 from deepshade.timing import significant
+from deepshade_report.plots import png, themed
 from deepshade_report.studies.common.bench import Bench
-from deepshade_report.studies.common.drawing import COLOURS
+from deepshade_report.studies.common.drawing import COLOURS, smaller
 from deepshade_report.studies.common.rows import Point, Row
 from deepshade_report.studies.common.shading import answers
 from deepshade_report.view import Float, View
@@ -89,15 +90,12 @@ def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
     """Crops of one bundle's worst places, and bars of all methods' shares."""
     from matplotlib.figure import Figure
 
-    from deepshade_report.plots import png, themed
-    from deepshade_report.studies.common.drawing import smaller
-
     methods = list(rows[0]["methods"])
     name = "balanced" if "balanced" in methods else methods[0]
     with themed():
         figure = Figure(figsize=(9.6, 1.55 * len(KINDS)), layout="constrained")
         figure.suptitle(TITLE, x=0.01, ha="left", fontsize=10, fontweight="bold")
-        left, right = figure.subfigures(1, 2, width_ratios=(3, 2))
+        left, right = list(figure.subfigures(1, 2, width_ratios=(3, 2)))
         grid = left.subplots(len(KINDS), 4)
         for line, kind in zip(grid, KINDS, strict=True):
             worst = max(rows, key=lambda row: float(row["methods"][name][kind]["worst"]))
@@ -140,7 +138,7 @@ def _contrast(plane: NDArray[Any]) -> NDArray[Any]:
 
     centred = plane - plane.mean()
     mean, square = uniform_filter(centred, _WINDOW), uniform_filter(centred**2, _WINDOW)
-    return np.sqrt(np.maximum(square - mean**2, 0))
+    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0)))
 
 
 def _worst(error: NDArray[Any]) -> dict[str, Any]:

@@ -99,9 +99,9 @@ def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
             if best := within(rows, budget, name):
                 ms = f"{name}, {best['ms']:.0f} ms"
                 shown[ms] = next(answers({name: found[best["point"]["error"]]}, view))[1]
-        for place, (name, image) in zip(made.axes[1:], shown.items(), strict=False):
+        for place, (label, image) in zip(made.axes[1:], shown.items(), strict=False):
             place.imshow(shading(image[0][crop]))
-            place.set_title(f"{name}: {view.dssim(image):.3f}" if name != "reference" else name)
+            place.set_title(label if label == "reference" else f"{label}: {view.dssim(image):.3f}")
         for place in made.axes[1:]:
             place.axis("off")
     return made.image

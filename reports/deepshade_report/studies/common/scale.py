@@ -16,22 +16,22 @@ class Scale:
     done with all `seeds`.
     """
 
-    learn_views: int = 144
-    val_views: int = 18
-    test_views: int = 36
+    learn_views: int = 96
+    val_views: int = 12
+    test_views: int = 24
     side: int = 128
     learn_spp: int = 64
     held_spp: int = 256
-    steps: int = 400
+    steps: int = 250
     batch: int = 8
-    curve: int = 8
-    effect_views: int = 54
-    effect_steps: int = 200
+    curve: int = 5
+    effect_views: int = 36
+    effect_steps: int = 125
     effect_side: int = 96
     wide_views: int = 8
     wide_side: int = 512
     wide_spp: int = 128
-    speed_seconds: float = 30.0
+    speed_seconds: float = 20.0
     pixels: int = 150
     trees: int = 20
     seeds: tuple[int, ...] = (0,)

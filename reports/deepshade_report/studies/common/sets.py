@@ -30,27 +30,31 @@ def specs(scale: Scale, folder: Path) -> dict[str, DataSpec]:
 
     every = expand_scenes(["procedural"])
     held = scale.val_views + scale.test_views
-    small = {"size": scale.side, "frame": scale.side}
-    wide = {"size": scale.wide_side, "frame": scale.wide_side}
-    effects = tuple(EFFECTS)
-    bright = {
-        "size": scale.effect_side,
-        "frame": scale.effect_side,
-        "environments": str(_map(folder)),
-        "skies": 0,
-        # motions, blur and scattering in proportion to smaller pictures
-        "max_blur": scale.effect_side / 8,
-        "max_motion": scale.effect_side / 8,
-        "max_scatter": scale.effect_side / 8,
-    }
     pool = diverse(scale.learn_views, every)
+
+    def plain(scenes: tuple[str, ...], views: int, side: int, spp: int) -> DataSpec:
+        return DataSpec(scenes, views, size=side, frame=side, spp=spp)
+
+    def bright(views: int, spp: int) -> DataSpec:
+        side, most = scale.effect_side, scale.effect_side / 8
+        return replace(
+            plain(every, views, side, spp),
+            effects=tuple(EFFECTS),
+            environments=str(_map(folder)),
+            skies=0,
+            # motions, blur and scattering in proportion to smaller pictures
+            max_blur=most,
+            max_motion=most,
+            max_scatter=most,
+        )
+
     sets = {
-        "learn": DataSpec(every, scale.learn_views, spp=scale.learn_spp, **small),
-        "held": DataSpec(every, held, spp=scale.held_spp, **small),
-        "diverse": DataSpec(pool, len(pool), spp=scale.learn_spp, **small),
-        "wide": DataSpec(every, scale.wide_views, spp=2 * scale.wide_spp, **wide),
-        "effects": DataSpec(every, scale.effect_views, effects, spp=scale.learn_spp, **bright),
-        "effects-held": DataSpec(every, held // 2, effects, spp=scale.held_spp, **bright),
+        "learn": plain(every, scale.learn_views, scale.side, scale.learn_spp),
+        "held": plain(every, held, scale.side, scale.held_spp),
+        "diverse": plain(pool, len(pool), scale.side, scale.learn_spp),
+        "wide": plain(every, scale.wide_views, scale.wide_side, 2 * scale.wide_spp),
+        "effects": bright(scale.effect_views, scale.learn_spp),
+        "effects-held": bright(held // 2, scale.held_spp),
     }
     return {
         name: replace(spec, seed=_SEED + number, shard_size=max(1, min(64, spec.views // 8)))
