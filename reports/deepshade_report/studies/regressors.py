@@ -8,6 +8,7 @@ than the raw ones that the paper's networks learn from.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -56,7 +57,9 @@ def measure(bench: Bench, point: Point) -> dict[str, Any]:
         learning = Dataset([bench.set("learn")], "ao")
         x, y = samples(learning, side, bench.scale.pixels, point["seed"])
         bench.doing(f"fitting {point['model']} to {len(y)} patches of {x.shape[1]} values")
-        model = _model(bench, point).fit(x, y)
+        with warnings.catch_warnings():  # of a perceptron that would go on learning
+            warnings.simplefilter("ignore")
+            model = _model(bench, point).fit(x, y)
         learnt = {"learning": round(time.perf_counter() - began, 1), "patches": len(y)}
     errors, seconds = [], 0.0
     for number in test:

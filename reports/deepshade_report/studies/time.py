@@ -109,9 +109,13 @@ def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
 
 def _methods(bench: Bench) -> dict[str, Method]:
     """Each bundle as it runs by default, and the rivals at all settings, by identity."""
-    found: list[Method] = []
-    for bundle in bench.context.served:
-        found.append(Network(bundle, load_engine(bundle, choose(bundle), threads=bench.threads)))
-    others, _ = baselines("ao", False, bench.threads)
-    found += [method for method in others if method.name in RIVALS]
-    return {identity(method): method for method in found}
+    if "methods" not in bench.cache:
+        served = [(bundle, choose(bundle)) for bundle in bench.context.served]
+        found: list[Method] = [
+            Network(bundle, load_engine(bundle, backend, threads=bench.threads))
+            for bundle, backend in served
+        ]
+        others, _ = baselines("ao", False, bench.threads)
+        found += [method for method in others if method.name in RIVALS]
+        bench.cache["methods"] = {identity(method): method for method in found}
+    return dict(bench.cache["methods"])

@@ -13,6 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from sys import stderr
 from types import ModuleType
+from typing import Any
 
 from deepshade.bundles import Bundle, bundle_folders
 from deepshade.engines import REFERENCE, load_engine
@@ -41,6 +42,7 @@ class Bench:
     views_from: Path | None = None
     resume: bool = False
     advance: Callable[[int, int, str], None] = lambda done, total, doing: None
+    cache: dict[str, Any] = field(default_factory=dict, init=False)
     _at: tuple[int, int] = field(default=(0, 1), init=False)
 
     def run(self, study: ModuleType) -> tuple[list[Row], Path]:

@@ -85,24 +85,26 @@ def trained(
     }
     splits = {split: shown(data, numbers) for split, numbers in splits.items()}
     often = max(1, made.steps // scale.curve)
-    every, run = Every(save=often, validate=made.steps + 1), Run(folder)
-    done = 0
-    for progress in train(
-        made,
-        folders,
-        run,
-        split=lambda found: (learning, splits["validation"][:2]),
-        every=every,
-    ):
-        done = progress.step
-        bench.doing(f"{name}: step {done} of {made.steps}, loss {progress.loss:.4f}")
-        if done % often == 0 or done == made.steps:
-            shader.network.load_state_dict(run.load()[0]["average"])
-            errors = {s: errors_of(shader.eval(), data, n) for s, n in splits.items()}
-            _note(folder / "curve.json", {"step": done, **errors})
-    curve = json.loads((folder / "curve.json").read_text("utf-8"))
-    if curve[-1]["step"] < made.steps:
+    every, run, notes = Every(often, made.steps + 1), Run(folder), folder / "curve.json"
+
+    def look(step: int) -> None:
+        """Note the errors of the checkpoint of `step`, if it is one of the curve's."""
+        if (step % often and step != made.steps) or step in {e["step"] for e in _noted(notes)}:
+            return
+        shader.network.load_state_dict(run.load()[0]["average"])
+        errors = {s: errors_of(shader.eval(), data, n) for s, n in splits.items()}
+        with replacing(notes) as temporary:
+            temporary.write_text(json.dumps([*_noted(notes), {"step": step, **errors}]), "utf-8")
+
+    if run.checkpoint.is_file():  # stopped, maybe before its errors were noted
+        look(run.load()[1])
+    held_out = splits["validation"][:2]  # the trainer looks at them once, at the end
+    for progress in train(made, folders, run, split=lambda _: (learning, held_out), every=every):
+        bench.doing(f"{name}: step {progress.step} of {made.steps}, loss {progress.loss:.4f}")
+        look(progress.step)
+    if run.load()[1] < made.steps:
         raise KeyboardInterrupt
+    curve = _noted(notes)
     last = curve[-1]
     return {
         "parameters": sum(p.numel() for p in network.parameters()),
@@ -134,9 +136,5 @@ def errors_of(shader: Shader, data: Dataset, numbers: Sequence[int]) -> dict[str
     return dict(zip(names, means, strict=True))
 
 
-def _note(path: Path, entry: dict[str, Any]) -> None:
-    """Add an entry to the curve, in place of those of the same step or later."""
-    before = json.loads(path.read_text("utf-8")) if path.is_file() else []
-    kept = [each for each in before if each["step"] < entry["step"]]
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps([*kept, entry]), "utf-8")
+def _noted(path: Path) -> list[dict[str, Any]]:
+    return list(json.loads(path.read_text("utf-8"))) if path.is_file() else []
