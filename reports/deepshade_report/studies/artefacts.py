@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deepshade.pictures import difference, normals, shading
+from deepshade.pictures import difference, shading
 from deepshade.timing import significant
 from deepshade_report.plots import png, themed
 from deepshade_report.studies.common.bench import Bench
@@ -95,29 +95,33 @@ def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
     with themed():
         figure = Figure(figsize=(9.6, 1.55 * len(KINDS)), layout="constrained")
         figure.suptitle(TITLE, x=0.01, ha="left", fontsize=10, fontweight="bold")
-        left, right = list(figure.subfigures(1, 2, width_ratios=(3, 2)))
-        grid = left.subplots(len(KINDS), 4)
-        for line, kind in zip(grid, KINDS, strict=True):
-            worst = max(rows, key=lambda row: float(row["methods"][name][kind]["worst"]))
-            view = bench.views[worst["point"]["view"]]
+        left, right = list(figure.subfigures(1, 2, width_ratios=(1, 1)))
+        grid = left.subplots(len(KINDS), 3)
+        for line, (kind, row) in zip(grid, _examples(rows, name).items(), strict=True):
+            view = bench.views[row["point"]["view"]]
             _, image = next(answers({name: bench.methods[name]}, view))
-            crop = _cropped(view, worst["methods"][name][kind]["at"])
-            pictures = (
-                normals(view.attributes["normal"])[crop],
-                shading(view.reference[0][crop]),
-                shading(image[0][crop]),
-                difference(image[0][crop], view.reference[0][crop]),
-            )
+            crop = _cropped(view, row["methods"][name][kind]["at"])
+            ours, theirs = image[0][crop], view.reference[0][crop]
+            pictures = shading(theirs), shading(ours), difference(ours, theirs)
             for axes, picture in zip(line, pictures, strict=True):
                 axes.imshow(picture)
                 axes.set_xticks([])
                 axes.set_yticks([])
             line[0].set_ylabel(kind, fontweight="bold")
-        for axes, title in zip(grid[0], ("normals", "reference", name, "difference"), strict=True):
+        for axes, title in zip(grid[0], ("reference", name, "difference"), strict=True):
             axes.set_title(title)
         axes = right.subplots()
         _bars(axes, rows, methods)
         return smaller(png(figure))
+
+
+def _examples(rows: Sequence[Row], name: str) -> dict[str, Row]:
+    """For each kind the view where a method's is worst, as far as possible each from another."""
+    found: dict[str, Row] = {}
+    for kind in KINDS:
+        free = [row for row in rows if row not in found.values()] or list(rows)
+        found[kind] = max(free, key=lambda row: float(row["methods"][name][kind]["worst"]))  # noqa: B023
+    return found
 
 
 def _bars(axes: Any, rows: Sequence[Row], methods: Sequence[str]) -> None:

@@ -66,7 +66,7 @@ def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
             axes.plot(angles, [row["noise"] for row in own], "--", color="#6b737c", label="noise")
             axes.set_title(HELD[held])
             axes.set_ylabel("DSSIM")
-        made.axes[2].set_title("share of doing nothing's; dotted: radius fixed in pixels")
+        made.axes[2].set_title("share of nothing's (dotted: in pixels)")
         made.axes[0].legend()
         for axes in made.axes:
             axes.set_ylim(bottom=0)

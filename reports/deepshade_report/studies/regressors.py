@@ -141,7 +141,11 @@ def _model(bench: Bench, point: Point) -> Any:
     from sklearn.neural_network import MLPRegressor
 
     return MLPRegressor(
-        (_HIDDEN,), early_stopping=True, n_iter_no_change=5, max_iter=60, random_state=point["seed"]
+        hidden_layer_sizes=(_HIDDEN,),
+        early_stopping=True,
+        n_iter_no_change=5,
+        max_iter=60,
+        random_state=point["seed"],
     )
 
 
