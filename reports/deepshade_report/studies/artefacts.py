@@ -95,7 +95,8 @@ def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
     with themed():
         figure = Figure(figsize=(9.6, 1.55 * len(KINDS)), layout="constrained")
         figure.suptitle(TITLE, x=0.01, ha="left", fontsize=10, fontweight="bold")
-        left, right = list(figure.subfigures(1, 2, width_ratios=(1, 1)))
+        halves: Any = figure.subfigures(1, 2)
+        left, right = halves
         grid = left.subplots(len(KINDS), 3)
         for line, (kind, row) in zip(grid, _examples(rows, name).items(), strict=True):
             view = bench.views[row["point"]["view"]]
@@ -120,7 +121,7 @@ def _examples(rows: Sequence[Row], name: str) -> dict[str, Row]:
     found: dict[str, Row] = {}
     for kind in KINDS:
         free = [row for row in rows if row not in found.values()] or list(rows)
-        found[kind] = max(free, key=lambda row: float(row["methods"][name][kind]["worst"]))  # noqa: B023
+        found[kind] = max(free, key=lambda row: float(row["methods"][name][kind]["worst"]))
     return found
 
 

@@ -92,13 +92,13 @@ def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
         plain(axes.xaxis)
         axes.legend()
         view, found = bench.views[0], _methods(bench)
-        low = max(0, (view.height - _CROP) // 2), max(0, (view.width - _CROP) // 2)
-        crop = slice(low[0], low[0] + _CROP), slice(low[1], low[1] + _CROP)
+        top, left = max(0, (view.height - _CROP) // 2), max(0, (view.width - _CROP) // 2)
+        crop = slice(top, top + _CROP), slice(left, left + _CROP)
         shown = {"reference": view.reference}
         for name in (middle, RIVALS[0]):
             if best := within(rows, budget, name):
-                ms = f"{name}, {best['ms']:.0f} ms"
-                shown[ms] = next(answers({name: found[best["point"]["error"]]}, view))[1]
+                label = f"{name}, {best['ms']:.0f} ms"
+                shown[label] = next(answers({name: found[best["point"]["error"]]}, view))[1]
         for place, (label, image) in zip(made.axes[1:], shown.items(), strict=False):
             place.imshow(shading(image[0][crop]))
             place.set_title(label if label == "reference" else f"{label}: {view.dssim(image):.3f}")

@@ -12,6 +12,7 @@ from deepshade_report.studies.common.rows import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from PIL import Image
 
 _NAMES = ("vermillion", "green", "blue", "purple", "orange", "sky", "soft", "ink")
 COLOURS = (*(PALETTE[name] for name in _NAMES), "#8c510a")
@@ -80,9 +81,20 @@ def smaller(image: bytes) -> bytes:
         with io.BytesIO() as stream:
             size = whole.width // shrink, whole.height // shrink
             picture = whole.resize(size, Image.Resampling.LANCZOS) if shrink > 1 else whole
-            few = picture.quantize(colours, kmeans=1, dither=Image.Dither.NONE)
+            few = picture.quantize(palette=_palette(picture, colours), dither=Image.Dither.NONE)
             few.save(stream, "PNG", optimize=True)
             image = stream.getvalue()
         if len(image) <= _MOST:
             break
     return image
+
+
+def _palette(picture: Image.Image, colours: int) -> Image.Image:
+    """The colours of lines, which cover little, and the picture's own."""
+    from PIL import Image
+
+    own = [int(tint[k : k + 2], 16) for tint in ("#ffffff", *COLOURS) for k in (1, 3, 5)]
+    found = picture.quantize(colours - len(own) // 3).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(own + found)
+    return palette
