@@ -31,13 +31,11 @@ def measure(bench: Bench, point: Point) -> dict[str, Any]:
 
 
 def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
-    """Errors on the training views, and on the test views, as shares of doing nothing's."""
+    """Errors on the training views, and on the test views."""
     with plot(2, TITLE, size=(9, 4)) as made:
         for axes, split in zip(made.axes, ("train", "test"), strict=True):
             name = (lambda row: str(row["point"]["effect"])) if split == "test" else _no_name
-            curves(axes, rows, name, splits=(split,), share=True)
-            axes.axhline(1, color="#6b737c", linewidth=0.8, linestyle=":")
-            axes.set_ylim(0, 1.5)
+            curves(axes, rows, name, splits=(split,))
     return made.image
 
 

@@ -43,18 +43,17 @@ class Plot:
 def curves(axes: Axes, rows: Sequence[Row], name: Callable[[Row], str], **shown: Any) -> None:
     """DSSIM over steps: a colour for each row, dotted training, dashed validation, solid test.
 
-    `shown` may hold `splits` and `share`: as a share of the trivial answer's.
+    `shown` may hold `splits`, those to draw.
     """
-    splits, share = shown.get("splits", STYLES), shown.get("share", False)
+    splits = shown.get("splits", STYLES)
     for row, colour in zip(rows, COLOURS, strict=False):
         steps = [entry["step"] for entry in row["curve"]]
         for split in splits:
-            each = [entry[split] for entry in row["curve"]]
-            values = [e["dssim"] / (e["trivial"] if share else 1) for e in each]
+            values = [entry[split]["dssim"] for entry in row["curve"]]
             label = name(row) if split == "test" else None
             axes.plot(steps, values, STYLES[split], color=colour, label=label)
     axes.set_xlabel("steps")
-    axes.set_ylabel("DSSIM, share of doing nothing's" if share else "DSSIM")
+    axes.set_ylabel("DSSIM")
     for split in splits:
         axes.plot([], [], STYLES[split], color=PALETTE["ink"], label=split)
     axes.set_ylim(bottom=0)
