@@ -22,6 +22,7 @@ _ORDER = (
 _MODULES = {
     "openexr": "OpenEXR",
     "pillow": "PIL",
+    "scikit-learn": "sklearn",
     "opentelemetry-sdk": "opentelemetry.sdk",
     "opentelemetry-exporter-otlp-proto-http": "opentelemetry.exporter.otlp.proto.http",
 }

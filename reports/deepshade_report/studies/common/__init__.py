@@ -1,0 +1,1 @@
+"""What studies share: their scale, data sets, rows, training curves and drawing."""
