@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import copy_context
 from typing import Any, TypeVar
 
@@ -33,10 +33,32 @@ async def unless(event: Coroutine[Any, Any, object], error: Exception, work: Awa
             raise error
         return job.result()
     finally:
-        for task in (job, other):
-            task.cancel()
-            with suppress(asyncio.CancelledError, Exception):
-                await task
+        await end(job, other)
+
+
+async def end(*tasks: asyncio.Future[Any]) -> None:
+    """Cancel tasks, and return when all have ended; what they raise is dropped.
+
+    Who is cancelled meanwhile gets that then: to suppress what awaiting them raises would lose it.
+    """
+    for task in tasks:
+        task.cancel()
+    await until_done(*tasks)
+
+
+async def until_done(*tasks: asyncio.Future[Any]) -> None:
+    """Returns when all have ended; raises CancelledError only then."""
+    cancelled: asyncio.CancelledError | None = None
+    while left := [task for task in tasks if not task.done()]:
+        try:
+            await asyncio.wait(left)
+        except asyncio.CancelledError as error:
+            cancelled = error
+    for task in tasks:
+        if not task.cancelled():
+            task.exception()  # so that asyncio doesn't report it as never retrieved
+    if cancelled is not None:
+        raise cancelled
 
 
 class Workers:
@@ -102,11 +124,7 @@ class Workers:
                 return await asyncio.shield(future)
             except asyncio.CancelledError:
                 cancelled.set()
-                while not future.done():
-                    with suppress(asyncio.CancelledError):
-                        await asyncio.wait([future])
-                if not future.cancelled():
-                    future.exception()  # so that asyncio doesn't report it as never retrieved
+                await until_done(future)
                 raise
             finally:
                 self._running.discard(cancelled)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import re
 import socket
 
 import pytest
+
+from deepshade_service.workers import unless
 
 HEAD = (
     "POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/x-exr\r\n"
@@ -40,3 +43,29 @@ def test_a_client_that_leaves_in_the_middle_of_its_body(
     assert service.client.post(
         "/shade/ao", content=body, headers={"Content-Type": "image/x-exr"}
     ).is_success
+
+
+def test_a_cancellation_while_others_are_cancelled_is_not_lost() -> None:
+    """Else who waits for the cancelled one, as a service that stops, waits for ever."""
+
+    async def main() -> bool:
+        ending = asyncio.Event()
+
+        async def slow_to_end() -> None:
+            try:
+                await asyncio.sleep(60)
+            finally:
+                ending.set()
+                await asyncio.sleep(0.01)
+
+        async def quick() -> int:
+            await asyncio.sleep(0)
+            return 1
+
+        task = asyncio.ensure_future(unless(slow_to_end(), ValueError(), quick()))
+        await ending.wait()
+        task.cancel()
+        await asyncio.wait([task])
+        return task.cancelled()
+
+    assert asyncio.run(main())

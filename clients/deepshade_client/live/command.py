@@ -8,7 +8,6 @@ import sys
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -155,8 +154,7 @@ async def run(
             feeding.result()
     finally:
         feeding.cancel()
-        with suppress(asyncio.CancelledError):
-            await feeding
+        await asyncio.gather(feeding, return_exceptions=True)
         if viewer is not None:
             viewer.close()
         told.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -129,7 +129,7 @@ class Publisher:
         self._finished = True
         self._arrived.set()
 
-    async def answers(self) -> AsyncIterator[LiveAnswer]:
+    async def answers(self) -> AsyncGenerator[LiveAnswer, None]:
         """All answers as they come, until everything is answered. Raises ClientError."""
         running = asyncio.ensure_future(self.run())
         try:
@@ -146,8 +146,7 @@ class Publisher:
                 return
         finally:
             running.cancel()
-            with suppress(asyncio.CancelledError, Exception):
-                await running
+            await asyncio.gather(running, return_exceptions=True)
 
     async def run(self) -> None:
         """Publish until everything is answered. Raises ClientError when that can't be."""

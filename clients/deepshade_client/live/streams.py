@@ -6,7 +6,7 @@ import asyncio
 import queue
 import secrets
 import threading
-from collections.abc import AsyncIterable, AsyncIterator, Iterable, Iterator
+from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator
 from contextlib import aclosing, suppress
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ async def stream(
     session: str | None = None,
     every: bool = True,
     **more: Any,
-) -> AsyncIterator[LiveAnswer]:
+) -> AsyncGenerator[LiveAnswer, None]:
     """The answers for pictures. `more` are those of `Publisher`."""
     names = effects if isinstance(effects, str) else ",".join(effects)
     settings = settings_of(options)
@@ -45,8 +45,7 @@ async def stream(
             feeding.result()
     finally:
         feeding.cancel()
-        with suppress(asyncio.CancelledError):
-            await feeding
+        await asyncio.gather(feeding, return_exceptions=True)
 
 
 def stream_sync(

@@ -11,7 +11,7 @@ import logging
 import threading
 import time
 from collections.abc import Awaitable, Callable, Sequence
-from contextlib import AsyncExitStack, suppress
+from contextlib import AsyncExitStack
 from dataclasses import dataclass, field, replace
 from math import prod
 from typing import Any, TypeVar
@@ -38,7 +38,7 @@ from deepshade_service.parameters import ShadeParameters
 from deepshade_service.problems import Problem
 from deepshade_service.shading import Job, Shader, run
 from deepshade_service.telemetry import Stopwatch, Telemetry
-from deepshade_service.workers import Cancelled
+from deepshade_service.workers import Cancelled, end
 
 log = logging.getLogger("deepshade.service")
 
@@ -252,14 +252,10 @@ class Pipeline:
             await asyncio.wait({task, newer}, return_when=asyncio.FIRST_COMPLETED)
             if not task.done():
                 self._session.meter.dropped += 1
-                task.cancel()
-                with suppress(asyncio.CancelledError):
-                    await task
                 raise Cancelled
             return task.result()
         finally:
-            newer.cancel()
-            task.cancel()
+            await end(task, newer)
 
     async def _infer(self, work: _Work) -> Answer:
         frame = work.frame
