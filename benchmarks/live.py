@@ -7,7 +7,8 @@ within one run, so that drift of the machine cancels:
 
 - local: frames a second of a session over those of the bare network on the same threads; the
   95th percentile of the answers' age in frame times; growth of the service's memory;
-- link: the same through a proxy that lets 100 Mbit/s through, each way;
+- link: a source of 60 frames a second, of which the newest counts, through a proxy that lets
+  100 Mbit/s through, each way;
 - viewers: the service's CPU seconds a frame with 1 and with 10 viewers, each less those without;
   the publisher's rate beside a viewer that reads nothing.
 
@@ -23,6 +24,7 @@ import os
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,7 @@ from deepshade_report.server import Server
 
 RATE = 100e6 / 8  # bytes a second of the slow link
 PIECE = 16384
+SLACK = 0.02  # seconds by which this process may be late and catch up, as a link's queue does
 TURNS = 3
 
 
@@ -87,8 +90,8 @@ async def _measure(server: Server, picture: Picture, options: Any, bare: Any) ->
     asked = Options(bundle=options.bundle, radius=0.5)
     each = options.seconds / TURNS
 
-    async def run(seconds: float, address: str = url, session: str = "bench") -> dict[str, Any]:
-        return await _streamed(address, session, picture, asked, seconds)
+    async def run(seconds: float, address: str = url, session: str = "bench", **how: Any) -> Any:
+        return await _streamed(address, session, picture, asked, seconds, **how)
 
     await run(3)  # loads and compiles
     memory = server._memory("VmRSS")
@@ -106,7 +109,7 @@ async def _measure(server: Server, picture: Picture, options: Any, bare: Any) ->
         "fps": round(live["fps"], 1),
     }
     async with _proxy(server._http.port) as port:
-        slow = await run(options.seconds, f"http://127.0.0.1:{port}", "slow")
+        slow = await run(options.seconds, f"http://127.0.0.1:{port}", "slow", rate=60)
     link = {k: round(slow[k], 3) for k in ("fps", "p95", "oldest")} | {"bytes": slow["bytes"]}
     costs, rates = {}, {}
     for count in (0, 1, 10):
@@ -127,19 +130,23 @@ async def _measure(server: Server, picture: Picture, options: Any, bare: Any) ->
 
 
 async def _streamed(
-    url: str, session: str, picture: Picture, asked: Options, seconds: float
+    url: str, session: str, picture: Picture, asked: Options, seconds: float, rate: float = 0
 ) -> dict[str, Any]:
-    """Frames as fast as they are answered; rates and ages without the first second's."""
+    """Frames as fast as they are answered, or at a `rate`, of which the newest counts; rates and
+    ages without the first second's."""
     begun = time.monotonic()
 
     def frames() -> Any:
+        count = 0
         while time.monotonic() < begun + seconds + 1:
-            yield picture
+            yield replace(picture, made=time.time()) if rate else picture
+            count += 1
+            time.sleep(max(0.0, begun + count / rate - time.monotonic()) if rate else 0)
 
     ages: list[float] = []
     times: list[float] = []
     size = 0
-    async for answer in stream(url, "ao", frames(), asked, session=session):
+    async for answer in stream(url, "ao", frames(), asked, session=session, every=not rate):
         if answer.error is not None:
             raise answer.error
         if time.monotonic() > begun + 1:
@@ -164,7 +171,7 @@ async def _proxy(port: int) -> AsyncIterator[int]:
         free = time.monotonic()
         with suppress(OSError):
             while part := await reader.read(PIECE):
-                free = max(free, time.monotonic()) + len(part) / RATE
+                free = max(free, time.monotonic() - SLACK) + len(part) / RATE
                 await asyncio.sleep(max(0.0, free - time.monotonic()))
                 writer.write(part)
                 await writer.drain()

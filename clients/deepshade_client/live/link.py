@@ -60,9 +60,11 @@ class Link:
         self._rates.append(size / max(seconds, 1e-5))
 
     def choose(self, size: int) -> str:
-        """The codec for a frame of so many bytes: the least time for packing, link and unpacking.
+        """The codec for a frame of so many bytes: the soonest there, and the most frames.
 
-        The one in use stays unless another is clearly better, lest it change to and fro.
+        A frame's age is the sum of packing, link and unpacking; the interval between two is the
+        slowest of them, for they overlap. The sum of both counts. The one in use stays unless
+        another is clearly better, lest it change to and fro.
         """
         rate = self.bytes_s
         if self._fixed is None and rate is not None:
@@ -74,4 +76,5 @@ class Link:
 
     def _seconds(self, codec: str, size: int, rate: float) -> float:
         _, pack, unpack = _MEASURED[codec]
-        return size / (pack * _MB) + size / (unpack * _MB) + size / self._ratio[codec] / rate
+        took = size / (pack * _MB), size / self._ratio[codec] / rate, size / (unpack * _MB)
+        return sum(took) + max(took)

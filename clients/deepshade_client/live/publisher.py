@@ -254,18 +254,36 @@ class Publisher:
             while True:
                 self._sending = picture
                 packed = await asyncio.to_thread(self._packed, picture, whole)
-                id, message, step, pixels, made = packed
-                await self._credit.wait()
-                if self._pending is None or self._every:
+                if not await self._newer():
                     break
-                picture, whole = self._take(), False  # a newer one came while this one waited
+                picture, whole = self._take(), False
+            id, message, step, pixels = packed
             self._credit.clear()
-            self._under_way[id] = picture, len(message), pixels, made
+            now = time.time()
+            live.stamp(message, time=picture.made or now, sent=now)
+            self._under_way[id] = picture, len(message), pixels, picture.made or now
             self._last, self._sending = (picture, step == 1), None
             began = time.monotonic()
             await socket.send(message)
             if id <= _MEASURE_FIRST or id % _MEASURE_EVERY == 0:
                 asyncio.get_running_loop().create_task(self._measure(socket, len(message), began))
+
+    async def _newer(self) -> bool:
+        """Waits until the service wants a frame: False; or a newer picture has come: True.
+
+        So what is packed while a link carries the frame before is at most one packing old.
+        """
+        if self._every:
+            await self._credit.wait()
+        while not self._credit.is_set() and self._pending is None:
+            self._arrived.clear()
+            events = [asyncio.ensure_future(e.wait()) for e in (self._credit, self._arrived)]
+            try:
+                await asyncio.wait(events, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for event in events:
+                    event.cancel()
+        return not self._credit.is_set()
 
     async def _next(self) -> tuple[Picture, bool] | None:
         """(what is sent next, whether it has to be whole); None where there is nothing now."""
@@ -297,8 +315,12 @@ class Publisher:
         self._taken.set()
         return picture
 
-    def _packed(self, picture: Picture, whole: bool) -> tuple[int, bytes, int, int, float]:
-        """(id, message, step, pixels, when it was made), in a thread. Raises ClientError."""
+    def _packed(self, picture: Picture, whole: bool) -> tuple[int, bytearray, int, int]:
+        """(id, message, step, pixels), in a thread; times are stamped on it when it is sent.
+
+        A picture that doesn't say when it was made, as those of a file, was so when it is sent.
+        Raises ClientError.
+        """
         assert self._link is not None, "it was welcomed"
         width, height = picture.size
         step = 1 if whole or self._pace is None else self._pace.choose(width * height)
@@ -308,8 +330,6 @@ class Publisher:
         if self._ids == 1 and self._codec is None:
             self._link.learn(small.planes.values())
         codec = self._link.choose(size)
-        now = time.time()
-        made = picture.made or now
         about = small.about() | ({"full": [width, height]} if step > 1 else {})
         flags = (live.CUT if picture.cut else 0) | (live.REST if whole else 0)
         message = live.pack(
@@ -318,8 +338,8 @@ class Publisher:
             small.planes,
             about,
             codec=codec,
-            time=made,
-            sent=now,
+            time=0.0,
+            sent=0.0,
             flags=flags,
         )
         self._link.packed(codec, size, len(message))
@@ -329,7 +349,7 @@ class Publisher:
                 f" service takes {self._most:,}",
                 fix="send a smaller picture, or start the service with a higher --live-frame",
             )
-        return self._ids, message, step, width * height // step**2, made
+        return self._ids, message, step, width * height // step**2
 
     async def _measure(self, socket: ClientConnection, size: int, began: float) -> None:
         """How long the link took for a frame: until a ping behind it has come back."""

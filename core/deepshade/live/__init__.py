@@ -11,6 +11,7 @@ from deepshade.live.frames import (
     pack,
     pack_picture,
     parse,
+    stamp,
 )
 
 __all__ = [
@@ -26,4 +27,5 @@ __all__ = [
     "pack",
     "pack_picture",
     "parse",
+    "stamp",
 ]

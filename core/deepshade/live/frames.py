@@ -27,6 +27,7 @@ CUT, REST = 1, 2
 _MAGIC, _VERSION = b"DSLF", 1
 _HEAD = struct.Struct("<4s4B4I2d")
 _SIZE = struct.Struct("<I")
+_TIME = struct.Struct("<d")
 _MAX_JSON = 2**16
 _MAX_TEXT = 1000
 _KINDS: dict[str, np.dtype[Any]] = {"half": np.dtype("<f2"), "float": np.dtype("<f4")}
@@ -91,7 +92,7 @@ def pack(
     time: float,
     sent: float,
     flags: int = 0,
-) -> bytes:
+) -> bytearray:
     """A message of planes (H, W), float16 or float32, all of one size; compressed on threads."""
     height, width = next(iter(planes.values())).shape
     found: dict[str, bytes] = {}
@@ -105,9 +106,16 @@ def pack(
     listed = [[name, kinds[plane.itemsize]] for name, plane in planes.items()]
     blocks = [found[name] for name in planes]
     head = _head(kind, codec, id, width, height, {"planes": listed, **about}, time, sent, flags)
-    return b"".join(
+    return bytearray().join(
         [*head, *(part for block in blocks for part in (_SIZE.pack(len(block)), block))]
     )
+
+
+def stamp(message: bytearray, *, time: float | None, sent: float) -> None:
+    """Write into a message of `pack` when it is sent, and, unless None, when it was made."""
+    if time is not None:
+        _TIME.pack_into(message, _HEAD.size - 2 * _TIME.size, time)
+    _TIME.pack_into(message, _HEAD.size - _TIME.size, sent)
 
 
 def pack_picture(

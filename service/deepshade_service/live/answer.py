@@ -92,7 +92,7 @@ class Answer:
             for name, plane in zip(EFFECTS[effect].outputs, shade, strict=False):
                 planes[f"{effect}.{name}"] = to_half(plane) if want.half else plane
         about["age_ms"] = self._age()
-        return live.pack(
+        packed = live.pack(
             live.ANSWER,
             self.id,
             planes,
@@ -102,6 +102,7 @@ class Answer:
             sent=now,
             flags=flags,
         )
+        return bytes(packed)
 
     def _age(self) -> float:
         return round(1e3 * (time.time() - self.made_at), 1)
