@@ -109,7 +109,7 @@ class Pipeline:
         self._trust = Trust()
         self._about: dict[str, Any] = {}
         self._granted = False
-        self._inferring = False
+        self._decoding = self._inferring = False
         self._settled: tuple[Asking, float] | None = None
 
     def offer(self, frame: live.Frame, made_at: float) -> None:
@@ -145,14 +145,17 @@ class Pipeline:
             (frame, made_at), self._pending = self._pending, None
             if not self._inferring and self._decoded.empty():
                 await self._grant()  # the link is what takes time: the next may set out
+            self._decoding = True
             await self._decoded.put(await self._or_told(frame, self._decode(frame, made_at)))
+            self._decoding = False
 
     async def _infer_all(self) -> None:
         while True:
             self._inferring = False
             work = await self._decoded.get()
             self._inferring = True
-            await self._grant()
+            if self._pending is None and not self._decoding:  # else one more would only age
+                await self._grant()
             answer: Answer | _Told = work if isinstance(work, _Told) else await self._answer(work)
             if isinstance(answer, _Told):
                 if answer.problem is not None:

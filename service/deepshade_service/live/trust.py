@@ -2,8 +2,9 @@
 
 The checks of a G-buffer take longer than all else that is done to it. What they find is how its
 renderer stores values, and that stays. So a stream whose first frame comes out the same without
-them does without for a second, and then they look again. Places in 16 bits are another matter: how
-coarse they are, and so whether they are repaired, differs from frame to frame.
+them does without for a second, and then they look again; each time that nothing has changed they
+wait twice as long, at most a minute. Places in 16 bits are another matter: how coarse they are, and
+so whether they are repaired, differs from frame to frame.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from deepshade.gbuffer import GBuffer
 from deepshade_service.parameters import ShadeParameters
 
-_AGAIN = 1.0  # seconds
+_AGAIN, _LONGEST = 1.0, 60.0  # seconds
 _PLACES = ("position", "position_world", "depth", "distance")
 
 
@@ -26,6 +27,7 @@ class Trust:
     def __init__(self) -> None:
         self._key: object = None
         self._until = 0.0
+        self._wait = _AGAIN
 
     def load(
         self,
@@ -46,9 +48,10 @@ class Trust:
         looked = key == self._key and self._until == 0  # they changed something: always check
         found = load(asked)
         if not looked:
-            self._key = key
             same = not _coarse(found, key[0]) and _same(found, load(trusting))
-            self._until = time.monotonic() + _AGAIN if same else 0.0
+            self._wait = min(2 * self._wait, _LONGEST) if key == self._key else _AGAIN
+            self._key = key
+            self._until = time.monotonic() + self._wait if same else 0.0
         return found
 
 
