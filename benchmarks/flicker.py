@@ -230,7 +230,7 @@ def measure(
     effect: str, folder: Path, models: Path, views: int, frames: int, size: int, samples: int
 ) -> Iterator[dict[str, Any]]:
     """A row for each path and method."""
-    context = Context(models, folder, Path("out"), effect=effect, quick=True)
+    context = Context([models], folder, Path("out"), effect=effect, quick=True)
     found, missing = methods(context)
     # what traces rays needs the scene as the data set has it, not as a path has moved it
     found = {name: each for name, each in found.items() if not getattr(each, "needs_scene", False)}
