@@ -27,7 +27,7 @@ CUT, REST = 1, 2
 _MAGIC, _VERSION = b"DSLF", 1
 _HEAD = struct.Struct("<4s4B4I2d")
 _SIZE = struct.Struct("<I")
-_TIME = struct.Struct("<d")
+_TIMES = struct.Struct("<2d")
 _MAX_JSON = 2**16
 _MAX_TEXT = 1000
 _KINDS: dict[str, np.dtype[Any]] = {"half": np.dtype("<f2"), "float": np.dtype("<f4")}
@@ -111,11 +111,9 @@ def pack(
     )
 
 
-def stamp(message: bytearray, *, time: float | None, sent: float) -> None:
-    """Write into a message of `pack` when it is sent, and, unless None, when it was made."""
-    if time is not None:
-        _TIME.pack_into(message, _HEAD.size - 2 * _TIME.size, time)
-    _TIME.pack_into(message, _HEAD.size - _TIME.size, sent)
+def stamp(message: bytearray, *, time: float, sent: float) -> None:
+    """Write into a message of `pack` when its picture was made, and when it is sent."""
+    _TIMES.pack_into(message, _HEAD.size - _TIMES.size, time, sent)
 
 
 def pack_picture(
