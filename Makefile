@@ -40,7 +40,7 @@ test: setup lint ## Lint, check types, run every test
 	@$(MAKE) --no-print-directory -j2 types pytest
 
 pytest: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadfile --max-worker-restart 0
 
 lint: setup ## Style and common mistakes
 	$(BIN)/ruff check .

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -145,13 +146,35 @@ def test_background_is_the_sky_at_infinity() -> None:
         assert (images[name][:, outside] == 0).all(), name
 
 
+def sky_map(path: Path) -> None:
+    pixels = np.zeros((3, 16, 32), np.float32)
+    pixels[0, :8], pixels[1, 8:] = 3.0, 70_000.0
+    with path.open("wb") as file:
+        exr.write(file, dict(zip("RGB", pixels, strict=True)))
+
+
+@pytest.mark.slow
+def test_one_thread_reads_exr_files_too(tmp_path: Path) -> None:
+    """As each of datagen's processes has; Mitsuba alone would wait for ever, deaf to signals."""
+    sky_map(tmp_path / "sky.exr")
+    (tmp_path / "sky.xml").write_text(
+        '<scene version="3.0.0"><shape type="sphere"/>'
+        '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter></scene>'
+    )
+    code = (
+        "import sys; from deepshade_workers.backend import mitsuba; mitsuba(); import drjit\n"
+        "from deepshade_workers.scenes.loading import open_scene\n"
+        "drjit.set_thread_count(1); scene = open_scene(sys.argv[1])\n"
+        "print(scene.name, drjit.thread_count())"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "sky.xml")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["sky", "1"], done.stderr
+
+
 def test_the_sky_is_seen_where_it_is(tmp_path: Path) -> None:
     """Red above and green below an empty horizon; without a sky, nothing."""
-    from deepshade_workers.backend import mitsuba
-
-    pixels = np.zeros((16, 32, 3), np.float32)
-    pixels[:8, :, 0], pixels[8:, :, 1] = 3.0, 70_000.0
-    mitsuba().Bitmap(pixels).write(str(tmp_path / "sky.exr"))
+    sky_map(tmp_path / "sky.exr")
     shape = '<shape type="sphere"><point name="center" x="9" y="9" z="9"/></shape>'
     sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
     for name, emitter in (("sky", sky), ("dark", '<emitter type="point"/>')):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from deepshade.errors import DeepshadeError
@@ -32,3 +34,19 @@ def mitsuba() -> Any:
     mi.set_variant("cuda_ad_rgb" if gpu else "llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)
     return mi
+
+
+@contextmanager
+def two_threads() -> Iterator[None]:
+    """At least two threads of Dr.Jit, to read and write EXR files with.
+
+    Mitsuba gives what is in them to the other threads; where there is none it waits for ever.
+    """
+    import drjit as dr
+
+    before = dr.thread_count()
+    dr.set_thread_count(max(2, before))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deepshade.errors import SceneError, nearest
-from deepshade_workers.backend import mitsuba
+from deepshade_workers.backend import mitsuba, two_threads
 from deepshade_workers.scenes.mesh import Floats, Ints, Mesh, Object, Paint
 from deepshade_workers.view import Vector
 
@@ -130,7 +130,8 @@ class Scene:
         """Load a Mitsuba XML scene with its own shapes, materials and lights."""
         mi = mitsuba()
         try:
-            traced = mi.load_file(str(path))
+            with two_threads():
+                traced = mi.load_file(str(path))
         except RuntimeError as error:
             raise SceneError(f"Mitsuba could not load {path}: {error}") from error
         box = traced.bbox()
