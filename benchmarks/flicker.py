@@ -3,7 +3,8 @@
 Views are a data set's own, their scenes rendered again, frame by frame. Each pixel's surface is
 followed into the next frame; where it is seen there too, the answer's change along with it is held
 against the reference's. `flicker` is the mean of what the answer changes more than the reference,
-of white. Prints JSON, one line a path and method, the worst first.
+of white. Our answers come once more as `--history` of a live session leaves them. Prints JSON, one
+line a path and method, the worst first.
 
     python benchmarks/flicker.py ao --data data/test-ao
     python benchmarks/flicker.py mb --data data/test-lens --views 1 --frames 3 --size 96
@@ -28,12 +29,15 @@ from deepshade.bundles import bundle_root
 from deepshade.effects import EFFECTS
 from deepshade.environments.stored import surroundings_of
 from deepshade.errors import DeepshadeError
+from deepshade.gbuffer import GBuffer
 from deepshade.gbuffer.background import remove
 from deepshade.manifest import Manifest
 from deepshade.tensors import median_depth
 from deepshade_report.context import Context
+from deepshade_report.method import Network
 from deepshade_report.sections.methods import methods, shaded
 from deepshade_report.view import Float, View
+from deepshade_service.live.history import History
 from deepshade_workers.records import view_of
 from deepshade_workers.render import render_sample
 from deepshade_workers.scenes.loading import open_scene
@@ -226,6 +230,17 @@ def _looked(image: Float, row: Float, column: Float) -> Float:
     return np.asarray(upper * (1 - y) + lower * y, np.float32)
 
 
+def _kept(effect: str, frames: list[Frame], answers: list[Float]) -> list[Float]:
+    """Answers as a live session with `--history`, but without a motion pass, would send them."""
+    history, kept = History(), []
+    for frame, answer in zip(frames, answers, strict=True):
+        view = frame.view
+        known = {name: view.attributes[name] for name in view.effect.inputs}
+        gbuffer = GBuffer(known, view.background, view.camera)
+        kept.append(history.blend(effect, answer, gbuffer, None, alone=False))
+    return kept
+
+
 def measure(
     effect: str, folder: Path, models: Path, views: int, frames: int, size: int, samples: int
 ) -> Iterator[dict[str, Any]]:
@@ -248,16 +263,19 @@ def measure(
             except (DeepshadeError, KeyError) as problem:
                 print(f"{name}: {problem}", file=sys.stderr)
                 continue
-            wobble = flicker(shots, answers, exposure)
-            error = float(np.mean([s.view.dssim(a) for s, a in zip(shots, answers, strict=True)]))
-            yield {
-                "effect": effect,
-                "path": path,
-                "method": name,
-                "family": method.family,
-                "flicker": wobble,
-                "dssim": error,
-            }
+            series = {name: answers}
+            if isinstance(method, Network) and EFFECTS[effect].history:
+                series[f"{name}, history"] = _kept(effect, shots, answers)
+            for title, shown in series.items():
+                errors = [s.view.dssim(a) for s, a in zip(shots, shown, strict=True)]
+                yield {
+                    "effect": effect,
+                    "path": path,
+                    "method": title,
+                    "family": method.family,
+                    "flicker": flicker(shots, shown, exposure),
+                    "dssim": float(np.mean(errors)),
+                }
 
 
 if __name__ == "__main__":

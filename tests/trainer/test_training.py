@@ -17,12 +17,14 @@ import pytest
 import torch
 
 from deepshade.bundles import bundle_root
+from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, DataError
 from deepshade_trainer.dataset import Dataset
-from deepshade_trainer.networks import from_bundle
+from deepshade_trainer.networks import Shader, build, from_bundle
 from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run
 from deepshade_trainer.training import train
+from deepshade_trainer.validation import answered
 
 from .conftest import write_data
 
@@ -44,6 +46,30 @@ def test_it_learns(data: Path, tmp_path: Path, recipe: Recipe) -> None:
     history = json.loads((tmp_path / "run/metrics.json").read_text())
     assert history[-1]["step"] == 120
     assert list((tmp_path / "run/log").glob("events*"))
+
+
+@pytest.mark.slow
+def test_steady_answers_change_less_where_the_picture_moves(
+    data: Path, tmp_path: Path, recipe: Recipe
+) -> None:
+    """The same weights, the same batches: with the term a moved picture's answer is nearer."""
+    begun = Run(tmp_path / "begun")
+    list(train(recipe.changed(steps=80, lr=4e-3), [data], begun))
+    held = Dataset([data], "ao")
+    changes = []
+    for steady in (0.0, 5.0):
+        run = Run(tmp_path / f"run{steady}")
+        further = recipe.changed(steps=60, init_from=str(begun.folder), steady=steady)
+        list(train(further, [data], run))
+        network = build(recipe.network)
+        network.load_state_dict(weights(run))
+        shader = Shader(EFFECTS["ao"], network).eval()
+        with torch.inference_mode():
+            whole = held.judged(0)[0]
+            moved = answered(shader, whole[:, :, 2:, 1:])
+            change = moved - answered(shader, whole)[:, :, 2:, 1:]
+        changes.append(float(change[:, :, 16:, 16:].abs().mean()))
+    assert changes[1] < 0.8 * changes[0]
 
 
 def test_a_stopped_run_ends_where_an_uninterrupted_one_does(

@@ -38,15 +38,18 @@ class Recipe:
     """Settings of a run; the defaults are ours.
 
     `optimizer` is "adamw", "adadelta" or, for perceptrons, "lbfgs"; `schedule` "cosine" (after
-    `warmup` steps) or "constant"; `precision` "bf16" or "fp32"; `ema` the weight average's decay a
-    step (0: none); `clip` bounds the gradient's norm (0: none). `val_fraction` of the scenes are
-    validated on and not trained on. `init_from` is the folder of a run, whose averaged weights to
-    begin with, or of a bundle; where names and shapes agree ("": at random).
+    `warmup` steps) or "constant"; `precision` "bf16" or "fp32"; `ema` the weight average's
+    decay a step (0: none); `clip` bounds the gradient's norm (0: none). `val_fraction` of the
+    scenes are validated on and not trained on. `steady` weighs how far an answer's values
+    change where the picture is moved by some pixels (0: not looked at, and half the work).
+    `init_from` is the folder of a run, whose averaged weights to begin with, or of a bundle;
+    where names and shapes agree ("": at random).
     """
 
     effect: str = "ao"
     network: NetworkConfig = field(default_factory=FoldConfig)
     loss: str = "dssim + 0.5 l1"
+    steady: float = 0.0
     optimizer: str = "adamw"
     lr: float = 2e-3
     weight_decay: float = 1e-4

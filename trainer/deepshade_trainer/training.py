@@ -33,6 +33,7 @@ from deepshade_trainer.validation import answered, validated
 
 VALIDATION_SAMPLES = 96
 MAX_BAD_BATCHES = 100
+_MOVED = 32  # pixels by which pictures are moved at most
 
 # From a data set the numbers of samples to train on, where one may come several times, and of
 # those to validate on.
@@ -277,6 +278,8 @@ class _Trainer:
         with torch.autocast(self.device.type, torch.bfloat16) if mixed else nullcontext():
             image = answered(self.shader, gbuffer)
         loss = self.loss(*self.shader.compared(image, reference))
+        if recipe.steady:
+            loss = (loss + self._moved(batch.step, gbuffer, reference, image)) / 2
         self.optimizer.zero_grad(set_to_none=True)
         if self._any(not torch.isfinite(loss)):
             return math.nan, f"loss {float(loss)}"
@@ -295,6 +298,18 @@ class _Trainer:
             for name, value in self.network.state_dict().items():
                 self.average[name].lerp_(value, 1 - decay)
         return float(loss.detach()), ""
+
+    def _moved(self, step: int, gbuffer: Tensor, reference: Tensor, image: Tensor) -> Tensor:
+        """The loss of the same pictures, moved by some pixels, and of what that changed."""
+        recipe, most = self.recipe, min(_MOVED, *(side // 4 for side in gbuffer.shape[2:]))
+        y, x = np.random.default_rng((recipe.seed, step)).integers(1, most + 1, 2).tolist()
+        part, truth = gbuffer[:, :, y:, x:], reference[:, :, y:, x:]
+        with torch.autocast(self.device.type, torch.bfloat16, recipe.precision == "bf16"):
+            moved = answered(self.shader, part)
+        # what the part doesn't show any more may rightly matter beside its edge
+        inner = slice(most, None)
+        change = moved[:, :, inner, inner] - image[:, :, y:, x:][:, :, inner, inner]
+        return self.loss(*self.shader.compared(moved, truth)) + recipe.steady * change.abs().mean()
 
     def _own(self, whole: Tensor) -> Tensor:
         """This process's part of a batch, on the device."""
