@@ -6,13 +6,13 @@ A service in a process of its own; publisher and viewers in this one. All rates 
 within one run, so that drift of the machine cancels:
 
 - local: frames a second of a session over those of the bare network on the same threads; the
-  95th percentile of the answers' age in frame times; growth of the service's memory;
+  95th percentile of the answers' age in frame times; the service's memory before and after each;
 - link: a source of 60 frames a second, of which the newest counts, through a proxy that lets
   100 Mbit/s through, each way;
 - viewers: the service's CPU seconds a frame with 1 and with 10 viewers, each less those without;
   the publisher's rate beside a viewer that reads nothing.
 
-Five minutes of each: `--seconds 300`.
+Five minutes of the first alone: `--seconds 300 --only local`.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ def main() -> None:
     parser.add_argument("--models", type=Path, default=Path("models"))
     parser.add_argument("--bundle", default="balanced")
     parser.add_argument("--seconds", type=float, default=30.0, help="of each measurement")
+    parser.add_argument("--only", choices=("local", "link", "viewers"))
     parser.add_argument("--threads", type=int, default=cpu_count())
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -94,36 +95,57 @@ async def _measure(server: Server, picture: Picture, options: Any, bare: Any) ->
         return await _streamed(address, session, picture, asked, seconds, **how)
 
     await run(3)  # loads and compiles
-    memory = server._memory("VmRSS")
-    ratios, ages = [], []
+    parts = {
+        "local": lambda: _local(server, run, each, bare),
+        "link": lambda: _link(server, run, options.seconds),
+        "viewers": lambda: _watched(server, run, url, each),
+    }
+    found: dict[str, Any] = {}
+    for name, part in parts.items():
+        if options.only in (None, name):
+            found |= await part()
+    return found
+
+
+async def _local(server: Server, run: Any, seconds: float, bare: Any) -> dict[str, Any]:
+    memory, ratios, ages, rates = [server._memory("VmRSS")], [], [], []
     for _ in range(TURNS):
-        network = bare(each / 4)
-        live = await run(each)
-        network = (network + bare(each / 4)) / 2
+        network = bare(seconds / 4)
+        live = await run(seconds)
+        network = (network + bare(seconds / 4)) / 2
+        rates.append(live["fps"])
         ratios.append(live["fps"] / network)
         ages.append(live["p95"] * live["fps"])
-    local = {
-        "rate / network's": _rounded(ratios),
-        "p95 age, frame times": _rounded(ages),
-        "memory, growth": round(server._memory("VmRSS") / memory - 1, 3),
-        "fps": round(live["fps"], 1),
+        memory.append(server._memory("VmRSS"))
+    return {
+        "local": {
+            "rate / network's": _rounded(ratios),
+            "p95 age, frame times": _rounded(ages),
+            "memory, MiB": [round(each / 2**20) for each in memory],
+            "fps": _rounded(rates),
+        }
     }
+
+
+async def _link(server: Server, run: Any, seconds: float) -> dict[str, Any]:
     async with _proxy(server._http.port) as port:
-        slow = await run(options.seconds, f"http://127.0.0.1:{port}", "slow", rate=60)
+        slow = await run(seconds, f"http://127.0.0.1:{port}", "slow", rate=60)
     link = {k: round(slow[k], 3) for k in ("fps", "p95", "oldest")} | {"bytes": slow["bytes"]}
+    return {"link of 100 Mbit/s": link}
+
+
+async def _watched(server: Server, run: Any, url: str, seconds: float) -> dict[str, Any]:
     costs, rates = {}, {}
     for count in (0, 1, 10):
         async with _viewers(url, "seen", count):
             before = _cpu(server.process.pid)
-            seen = await run(each, session="seen")
+            seen = await run(seconds, session="seen")
             costs[count] = (_cpu(server.process.pid) - before) / seen["frames"]
     for stalled in (0, 1, 0, 1):
         async with _viewers(url, "stall", stalled, reads=False):
-            rates.setdefault(stalled, []).append((await run(each, session="stall"))["fps"])
+            rates.setdefault(stalled, []).append((await run(seconds, session="stall"))["fps"])
     encoding = costs[1] - costs[0]
     return {
-        "local": local,
-        "link of 100 Mbit/s": link,
         "ten viewers, in encodings for one": round((costs[10] - costs[0]) / encoding, 2),
         "rate beside a stalled viewer": round(sum(rates[1]) / sum(rates[0]), 3),
     }
