@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from deepshade import tracing
+from deepshade.machine import share_heaps
 from deepshade.serving import listen, logging_config
 
 if TYPE_CHECKING:
@@ -171,6 +172,7 @@ def _run(settings: Settings, listener: socket.socket, log_level: str) -> None:
     from deepshade_service.app import create_app
     from deepshade_service.server import Server
 
+    share_heaps()
     tracing.begin("deepshade-service")
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
