@@ -44,7 +44,7 @@ class Size:
     training: tuple[str, ...]
 
 
-SMALL = Size(24, 128, 16, ("--steps", "12", "--lr", "0.001", "--worse", "1", "--slower", "100"))
+SMALL = Size(48, 128, 32, ("--steps", "24", "--lr", "0.001", "--worse", "1", "--slower", "100"))
 WHOLE = Size(64, 256, 128, ("--minutes", "8"))
 SCENE = "procedural:fences:3"
 

@@ -118,7 +118,7 @@ class Alias:
             for name in files:
                 with replacing(scratch / name) as temporary:
                     shutil.copyfile(bundle / name, temporary)
-                    temporary.chmod(0o444)
+                (scratch / name).chmod(0o444)  # not before: who isn't root may not sync it then
             while True:
                 number = max(self.numbers(), default=0) + 1
                 record = {"effect": self.effect, "name": self.name, "number": number}

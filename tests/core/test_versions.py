@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
+import tempfile
 import threading
 from pathlib import Path
 
@@ -52,6 +56,34 @@ def test_versions_are_numbered_and_the_same_content_is_the_same_version(
     record = json.loads((alias.folder / "1/version.json").read_text())
     assert record["files"]["model.onnx"] == hashlib.sha256(b"one").hexdigest()
     assert [each.current for each in aliases(tmp_path / "models")] == [2]
+
+
+PUBLISH = """
+import os, sys
+from pathlib import Path
+from deepshade.versions import Alias
+os.setuid(10001)
+alias = Alias(Path(sys.argv[1]), "ao", "balanced")
+version = alias.publish(Path(sys.argv[2]))
+alias.point(version.number)
+print(version.number)
+"""
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root can be another"
+)
+def test_who_is_not_root_publishes_too() -> None:
+    """As in a container: root may write where nobody else may, and so would see nothing."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:  # pytest's own are for root alone
+        bundle, models = make(Path(name) / "bundle", b"one"), Path(name) / "models"
+        models.mkdir()
+        os.chown(models, 10001, 10001)
+        Path(name).chmod(0o755)
+        command = [sys.executable, "-c", PUBLISH, str(models), str(bundle)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert done.stdout.split() == ["1"], done.stderr
+        assert load(models / "ao" / "balanced").path.name == "1"
 
 
 def test_readers_see_the_alias_alone(alias: Alias, tmp_path: Path) -> None:

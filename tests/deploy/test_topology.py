@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
+import subprocess
+import sys
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -14,6 +16,28 @@ from typing import Any
 import pytest
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+def within(topology: ModuleType, factory: pytest.TempPathFactory, name: str) -> Path:
+    """A folder where other users come in."""
+    if not topology.permitted():
+        pytest.skip("namespaces and mounts need root, and leave to make them")
+    folder = factory.mktemp(name)
+    for place in (folder, *folder.parents[:2]):  # pytest's are for its own user alone
+        place.chmod(0o755)
+    return folder
+
+
+def test_the_loop_closes(
+    root: Path, topology: ModuleType, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """`scripts/loop.py --small`: rendered on Ray, fine-tuned, published, served, rolled back."""
+    folder = within(topology, tmp_path_factory, "loop")
+    command = [sys.executable, root / "scripts/loop.py", "--small", "--out", folder / "out"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    assert "published as ao/balanced 2" in done.stdout
+
 
 ASK = """
 import os, sys, urllib.error, urllib.request
@@ -32,11 +56,7 @@ def running(
     root: Path, topology: ModuleType, secrets: ModuleType, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Any]:
     """The service and the trainer."""
-    if not topology.permitted():
-        pytest.skip("namespaces and mounts need root, and leave to make them")
-    folder = tmp_path_factory.mktemp("topology")
-    for place in (folder, *folder.parents[:2]):  # pytest's are for its own user alone
-        place.chmod(0o755)
+    folder = within(topology, tmp_path_factory, "topology")
     assert secrets.main(["--out", str(folder / ".env")]) == 0
     document = topology.read(root / "docker-compose.yml", folder / ".env")
     with topology.Topology(document, folder) as up:
