@@ -11,8 +11,8 @@ from functools import cache
 from pathlib import Path
 
 _CGROUP = Path("/sys/fs/cgroup")
-# What makes one processor of a name several times as fast as another: the first that it has.
 _ARENA_MAX = -8  # malloc.h: M_ARENA_MAX
+# What makes one processor of a name several times as fast as another: the first that it has.
 _WIDEST = {"amx_tile": "AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
 
 
