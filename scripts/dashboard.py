@@ -94,6 +94,11 @@ PANELS: tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...] = (
             ("deepshade_trainer_oldest_seconds", "seconds"),
         ),
     ),
+    (
+        "Free on the disks",
+        "percentunit",
+        (("deepshade_trainer_disk_free_ratio", "{{folder}}"),),
+    ),
 )
 
 

@@ -4,9 +4,10 @@
     sudo python scripts/loop.py --scene scenes/living_room.gltf
 
 Services up with new tokens; `ray job submit -- deepshade datagen` renders views of one scene, a
-procedural one or a file, whose folder is copied; the trainer fine-tunes ambient occlusion to them
-and publishes it; the shading service answers with the new version, and after a rollback with the
-old; all down. Says what it does and how long it took, and ends with 1 where anything is otherwise.
+procedural one or a file, whose folder is copied, and one more, at which the script looks; the
+trainer fine-tunes ambient occlusion to them and publishes it; the shading service answers with the
+new version, and after a rollback with the old; all down. Says what it does and how long it took,
+and ends with 1 where anything is otherwise. OUT/before-after-reference.png is that other view.
 `--images` takes roots of scripts/images.py.
 """
 
@@ -26,6 +27,8 @@ from typing import Any
 
 import httpx
 
+from deepshade import exr, metrics, pictures
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
 
@@ -41,11 +44,18 @@ class Size:
     views: int
     pixels: int
     rays: int
+    looked: tuple[str, ...]  # at one more view
     training: tuple[str, ...]
 
 
-SMALL = Size(48, 128, 32, ("--steps", "24", "--lr", "0.001", "--worse", "1", "--slower", "100"))
-WHOLE = Size(64, 256, 128, ("--minutes", "8"))
+SMALL = Size(
+    48,
+    128,
+    32,
+    ("--size", "128x128", "--spp", "64"),
+    ("--steps", "24", "--lr", "0.001", "--worse", "1", "--slower", "100"),
+)
+WHOLE = Size(64, 256, 128, ("--size", "768x512", "--spp", "512"), ("--minutes", "8"))
 SCENE = "procedural:fences:3"
 
 
@@ -67,11 +77,11 @@ def prepare(out: Path) -> dict[str, Any]:
     return read(ROOT / "docker-compose.yml", out / ".env")
 
 
-def shaded(topology: Topology) -> tuple[str, bytes]:
+def shaded(topology: Topology, view: Path = ROOT / "samples/room.exr") -> tuple[str, bytes]:
     """The hash of the bundle that answers, and the picture."""
     answer = httpx.post(
         f"http://{topology.published}:8000/shade/ao",
-        content=(ROOT / "samples/room.exr").read_bytes(),
+        content=view.read_bytes(),
         headers={"Content-Type": "image/x-exr"},
         timeout=120,
         trust_env=False,
@@ -88,6 +98,23 @@ def render(topology: Topology, size: Size, scene: str = SCENE) -> None:
         *("deepshade", "datagen", "--out", "/shards/mine", "--scenes", scene),
         *("--views", str(size.views), "--size", str(size.pixels), "--spp", str(size.rays)),
     )
+
+
+def look(topology: Topology, size: Size, scene: str = SCENE) -> Path:
+    """Have one more view rendered, from where most of the scene is seen, with its reference."""
+    where = ("-o", "/shards/view.exr", *size.looked)
+    topology.execute("ray-head", "deepshade", "render", scene, *where)
+    return topology.volume("shards") / "view.exr"
+
+
+def compare(view: Path, before: bytes, after: bytes, out: Path) -> str:
+    """A picture of both answers beside the reference; a sentence on their errors."""
+    reference = exr.read(view, ["reference_ao.V"]).pixels["reference_ao.V"]
+    answers = [exr.read(each, ["Y"]).pixels["Y"] for each in (before, after)]
+    row = [pictures.shading(each) for each in (*answers, reference)]
+    pictures.save(out / "before-after-reference.png", pictures.beside(row))
+    first, second = (metrics.dssim(each, reference) for each in answers)
+    return f"another view: DSSIM {first:.4f} before, {second:.4f} after"
 
 
 def client(topology: Topology, *words: str, check: bool = True) -> Any:
@@ -114,22 +141,26 @@ def within(topology: Topology, scene: str) -> str:
     return f"/shards/scene/{path.name}"
 
 
-def loop(topology: Topology, size: Size, scene: str = SCENE) -> None:
+def loop(topology: Topology, size: Size, out: Path, scene: str = SCENE) -> None:
     """Once around. Raises RuntimeError where something isn't as it should be."""
     with step(f"up: {', '.join(SERVICES)}"):
         topology.up(*SERVICES)
-    first, _ = shaded(topology)
     with step(f"ray job submit: {size.views} views of {scene}"):
-        render(topology, size, within(topology, scene))
+        inside = within(topology, scene)
+        render(topology, size, inside)
+    with step("deepshade render: one more"):
+        view = look(topology, size, inside)
+    first, before = shaded(topology, view)
     with step("train"):
         job = tune(topology, size)
     print(f"  {job['sentence']}")
-    second, _ = shaded(topology)
+    second, after = shaded(topology, view)
     if second == first:
         raise RuntimeError("the service answers with the old version")
+    print(f"  {compare(view, before, after, out)}")
     with step("rollback"):
         client(topology, "rollback", "ao/balanced")
-    if shaded(topology)[0] != first:
+    if shaded(topology, view) != (first, before):
         raise RuntimeError("after the rollback the service doesn't answer with the old version")
     with step("down"):
         ended = {name: topology.stop(name) for name in reversed(SERVICES)}
@@ -153,7 +184,7 @@ def main() -> int:
         return 2
     try:
         with Topology(prepare(asked.out), asked.out, asked.images) as topology:
-            loop(topology, SMALL if asked.small else WHOLE, asked.scene)
+            loop(topology, SMALL if asked.small else WHOLE, asked.out, asked.scene)
     except (RuntimeError, httpx.HTTPError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1

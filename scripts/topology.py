@@ -81,11 +81,19 @@ class Topology:
         self.services: dict[str, Any] = document["services"]
         self._folder, self._built = folder.resolve(), built
         self.running: dict[str, Running] = {}
-        tag = os.getpid() % 10000
-        self._bridge, self._net = f"ds{tag}", 64 + os.getpid() % 64
-        self._addresses = {name: f"10.{self._net}.0.{n + 10}" for n, name in enumerate(self._all())}
         self._made: list[str] = []
+        self._bridge, self._net = self._free()
+        self._addresses = {name: f"10.{self._net}.0.{n + 10}" for n, name in enumerate(self._all())}
         self.published = f"10.{self._net}.1.2"
+
+    def _free(self) -> tuple[str, int]:
+        """The bridge's namespace, and the N of 10.N.x.x: its name says that they are taken."""
+        for net in range(64, 128):
+            made = subprocess.run(["ip", "netns", "add", f"ds{net}"], capture_output=True)
+            if made.returncode == 0:
+                self._made.append(f"ds{net}")
+                return f"ds{net}", net
+        raise RuntimeError(f"no namespace ds64 to ds127 can be made: {made.stderr.decode()}")
 
     def _all(self) -> list[str]:
         return [*self.services, "ray-worker-2", "ray-worker-3"]
@@ -94,7 +102,7 @@ class Topology:
         self._folder.mkdir(parents=True, exist_ok=True)
         hosts = "".join(f"{address} {name}\n" for name, address in self._addresses.items())
         (self._folder / "hosts").write_text("127.0.0.1 localhost\n" + hosts)
-        self._namespace(self._bridge)
+        self._ip("link set lo up", of=self._bridge)
         self._ip("link add br0 type bridge", "link set br0 up", of=self._bridge)
         return self
 
@@ -256,6 +264,7 @@ class Topology:
         if self._built is None:
             self._shims()
             passed = {ROOT, Path(sys.prefix), Path(sys.base_prefix), self._folder}
+            self._seen(name, service, passed - {self._folder})
             parents = {p for each in passed for p in (each, *each.parents)} - {Path("/")}
             lines.append(f"chmod o+x {' '.join(quoted(f'root{p}') for p in sorted(parents))}")
         lines += ["mount -t proc proc root/proc", "mount -t sysfs -o ro sysfs root/sys"]
@@ -286,6 +295,15 @@ class Topology:
         inside = self._inside(service, image, command)
         lines.append(f"exec chroot {quoted(str(at))} {shlex.join(inside)}")
         return "\n".join(lines) + "\n"
+
+    def _seen(self, name: str, service: Any, passed: set[Path]) -> None:
+        """Raises RuntimeError where a container's tmpfs would hide what it runs from."""
+        for target in (each.partition(":")[0] for each in service.get("tmpfs", ())):
+            if hidden := [str(each) for each in passed if each.is_relative_to(target)]:
+                raise RuntimeError(
+                    f"{', '.join(sorted(hidden))} can't be seen in {name}, which has a tmpfs at "
+                    f"{target}: run this from a clone and an environment elsewhere"
+                )
 
     def _shims(self) -> None:
         """Commands that this environment's own may lack: those of the sources."""

@@ -38,8 +38,10 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     event = {"phase": "training", "step": 1, "steps": 2, "loss": 0.1, "validation": {"dssim": 0.2}}
     event |= {"rate": 3.0, "left": 4.0}
     jobs = store(tmp_path_factory.mktemp("store"))
-    text = service.render().decode() + Trainer(jobs, lambda _: event).render().decode()
+    folders = (tmp_path_factory.getbasetemp(), Path("/is/not/there"))
+    text = service.render().decode() + Trainer(jobs, lambda _: event, folders).render().decode()
     jobs.close()
+    assert text.count("disk_free_ratio{") == 1
     found: dict[str, set[str]] = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:

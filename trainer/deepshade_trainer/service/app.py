@@ -43,7 +43,11 @@ class Trainer:
         self.publisher = Publisher(settings)
         self.queue = Queue(settings, self.store, self.publisher)
         self.uploads = Uploads(settings.folder / "uploads", settings.upload_bytes)
-        self.telemetry = Telemetry(self.store, lambda job: last_event(self.queue.folder(job)))
+        self.telemetry = Telemetry(
+            self.store,
+            lambda job: last_event(self.queue.folder(job)),
+            (settings.folder, settings.published, *settings.data),
+        )
         self.stopping = asyncio.Event()
 
     @asynccontextmanager

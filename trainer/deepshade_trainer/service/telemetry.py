@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from prometheus_client import CollectorRegistry, generate_latest
@@ -28,10 +31,18 @@ _PROGRESS = (
 
 
 class Telemetry(Collector):
-    """The figures of a store; `last` gives a job's last event by its id."""
+    """The figures of a store, and of the disks that `folders` are on.
 
-    def __init__(self, store: Store, last: Callable[[str], dict[str, Any] | None]) -> None:
-        self._store, self._last = store, last
+    `last` gives a job's last event by its id.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        last: Callable[[str], dict[str, Any] | None],
+        folders: Collection[Path] = (),
+    ) -> None:
+        self._store, self._last, self._folders = store, last, folders
         self._registry = CollectorRegistry()
         self._registry.register(self)
 
@@ -49,6 +60,14 @@ class Telemetry(Collector):
         yield GaugeMetricFamily(
             "deepshade_trainer_resident_bytes", "Physical memory of the service", memory
         )
+        free = GaugeMetricFamily(
+            "deepshade_trainer_disk_free_ratio", "Share of a folder's disk", labels=["folder"]
+        )
+        for folder in self._folders:
+            with suppress(OSError):  # it was taken away
+                usage = shutil.disk_usage(folder)
+                free.add_metric([str(folder)], usage.free / usage.total)
+        yield free
         try:
             counts, published = self._store.counts(), self._store.published()
             running, oldest = self._store.in_state(RUNNING), self._store.oldest()
