@@ -17,7 +17,8 @@ import time
 from pathlib import Path
 
 from deepshade.machine import describe
-from deepshade_workers.datagen import DataSpec, expand_scenes, generate, make_sample
+from deepshade_workers.datagen import generate, make_sample
+from deepshade_workers.dataspec import DataSpec, expand_scenes
 
 WORKERS = 2
 

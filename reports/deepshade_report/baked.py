@@ -37,7 +37,8 @@ from deepshade_trainer.recipe import preset
 from deepshade_trainer.run import Run
 from deepshade_trainer.training import train
 from deepshade_workers.circles import view_around
-from deepshade_workers.datagen import DataSpec, make_shard, open_manifest
+from deepshade_workers.datagen import make_shard, open_manifest
+from deepshade_workers.dataspec import DataSpec
 from deepshade_workers.render import render_sample
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.scene import Scene

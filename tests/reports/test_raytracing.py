@@ -18,7 +18,8 @@ try:
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Mitsuba, Open Image Denoise or libLLVM
     pytest.skip(f"no ray tracing here: {error}", allow_module_level=True)
 
-from deepshade_workers.datagen import DataSpec, make_shard
+from deepshade_workers.datagen import make_shard
+from deepshade_workers.dataspec import DataSpec
 from deepshade_workers.scenes.mesh import Mesh, merge
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.shards import schema

@@ -29,16 +29,8 @@ from deepshade.environments.stored import read_stored, stored_path
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import Manifest, Shard
-from deepshade_workers.datagen import (
-    DataSpec,
-    _complete,
-    default_shard_size,
-    expand_scenes,
-    generate,
-    make_sample,
-    make_shard,
-    open_manifest,
-)
+from deepshade_workers.datagen import _complete, generate, make_sample, make_shard, open_manifest
+from deepshade_workers.dataspec import DataSpec, default_shard_size, expand_scenes
 from deepshade_workers.maps import MAX_HEIGHT
 from deepshade_workers.records import view_of
 from deepshade_workers.render import render_sample

@@ -12,7 +12,8 @@ import pytest
 from deepshade.errors import ConfigError, SceneError
 from deepshade_workers import references
 from deepshade_workers.attributes import make_attributes
-from deepshade_workers.datagen import DataSpec, expand_scenes, make_sample, make_shard
+from deepshade_workers.datagen import make_sample, make_shard
+from deepshade_workers.dataspec import DataSpec, expand_scenes
 from deepshade_workers.records import record_of, view_of
 from deepshade_workers.render import render_sample
 from deepshade_workers.scenes.composition import compose

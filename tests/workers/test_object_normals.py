@@ -9,7 +9,8 @@ from deepshade import circles as places
 from deepshade.camera import Camera
 from deepshade.errors import ConfigError
 from deepshade_workers.circles import render_circles, view_around
-from deepshade_workers.datagen import DataSpec, make_sample
+from deepshade_workers.datagen import make_sample
+from deepshade_workers.dataspec import DataSpec
 from deepshade_workers.render import render_sample
 from deepshade_workers.scenes.mesh import Mesh, merge
 from deepshade_workers.scenes.procedural import FAMILIES

@@ -16,7 +16,8 @@ from deepshade.camera import Camera
 from deepshade.effects import EFFECTS
 from deepshade.errors import ConfigError, SceneError
 from deepshade_workers import references
-from deepshade_workers.datagen import DataSpec, make_sample
+from deepshade_workers.datagen import make_sample
+from deepshade_workers.dataspec import DataSpec
 from deepshade_workers.render import render, render_sample
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.mesh import Object, merge

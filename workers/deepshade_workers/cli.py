@@ -321,7 +321,8 @@ def datagen(
 
       ray job submit -- deepshade datagen --out /shared/ao --scenes procedural --views 20000
     """
-    from deepshade_workers.datagen import DataSpec, default_shard_size, expand_scenes, generate
+    from deepshade_workers.datagen import generate
+    from deepshade_workers.dataspec import DataSpec, default_shard_size, expand_scenes
     from deepshade_workers.scenes.loading import notes_of
     from deepshade_workers.scenes.summary import warn
 

@@ -72,6 +72,6 @@ def draw(bench: Bench, rows: Sequence[Row]) -> bytes:
 
 
 def _families() -> tuple[str, ...]:
-    from deepshade_workers.datagen import expand_scenes
+    from deepshade_workers.dataspec import expand_scenes
 
     return expand_scenes(["procedural"])

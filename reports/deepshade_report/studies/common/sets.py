@@ -15,7 +15,7 @@ from deepshade.files import replacing
 from deepshade_report.studies.common.scale import Scale
 
 if TYPE_CHECKING:
-    from deepshade_workers.datagen import DataSpec
+    from deepshade_workers.dataspec import DataSpec
 
 DIVERSITY = (1, 2, 5, 10)  # families; and all of them
 _SEED = 16000
@@ -26,7 +26,7 @@ def specs(scale: Scale, folder: Path) -> dict[str, DataSpec]:
 
     `folder` is where an environment map is written to.
     """
-    from deepshade_workers.datagen import DataSpec, expand_scenes
+    from deepshade_workers.dataspec import DataSpec, expand_scenes
 
     every = expand_scenes(["procedural"])
     held = scale.val_views + scale.test_views
