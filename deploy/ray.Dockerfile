@@ -14,7 +14,7 @@ RUN apt-get update -qq && \
     DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends libllvm19 && \
     rm -rf /var/lib/apt/lists/*
 RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin deepshade && \
-    mkdir -p /jobs/rendered /shards && chown -R 10001:10001 /jobs /shards
+    mkdir -p /jobs/rendered /shards /library && chown -R 10001:10001 /jobs /shards /library
 COPY --from=build /opt/deepshade /opt/deepshade
 ENV PATH=/opt/deepshade/bin:/usr/local/bin:/usr/bin:/bin PYTHONUNBUFFERED=1 \
     PYTHONDONTWRITEBYTECODE=1 HOME=/tmp RAY_USAGE_STATS_ENABLED=0

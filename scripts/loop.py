@@ -45,6 +45,7 @@ class Size:
     pixels: int
     rays: int
     looked: tuple[str, ...]  # at one more view
+    library: dict[str, tuple[str, ...]]  # older views: to rehearse, and that mustn't get worse
     training: tuple[str, ...]
 
 
@@ -53,9 +54,20 @@ SMALL = Size(
     128,
     32,
     ("--size", "128x128", "--spp", "64"),
+    {},
     ("--steps", "24", "--lr", "0.001", "--worse", "1", "--slower", "100"),
 )
-WHOLE = Size(64, 256, 128, ("--size", "768x512", "--spp", "512"), ("--minutes", "8"))
+WHOLE = Size(
+    64,
+    256,
+    128,
+    ("--size", "768x512", "--spp", "512"),
+    {
+        "rehearsal": ("--views", "96", "--frame", "512", "--spp", "128", "--seed", "201"),
+        "test": ("--views", "36", "--frame", "512", "--spp", "512", "--seed", "202"),
+    },
+    ("--minutes", "8"),
+)
 SCENE = "procedural:fences:3"
 
 
@@ -92,11 +104,16 @@ def shaded(topology: Topology, view: Path = ROOT / "samples/room.exr") -> tuple[
 
 def render(topology: Topology, size: Size, scene: str = SCENE) -> None:
     """Have Ray render a data set of a scene, as its workers see it, into the volume `shards`."""
+    settings = ("--views", size.views, "--size", size.pixels, "--spp", size.rays)
+    datagen(topology, "/shards/mine", scene, *map(str, settings))
+
+
+def datagen(topology: Topology, out: str, scenes: str, *settings: str) -> None:
+    """`deepshade datagen` as a job of Ray's."""
     topology.execute(
         "ray-head",
         *("ray", "job", "submit", "--address", "http://127.0.0.1:8265", "--"),
-        *("deepshade", "datagen", "--out", "/shards/mine", "--scenes", scene),
-        *("--views", str(size.views), "--size", str(size.pixels), "--spp", str(size.rays)),
+        *("deepshade", "datagen", "--out", out, "--scenes", scenes, *settings),
     )
 
 
@@ -148,6 +165,9 @@ def loop(topology: Topology, size: Size, out: Path, scene: str = SCENE) -> None:
     with step(f"ray job submit: {size.views} views of {scene}"):
         inside = within(topology, scene)
         render(topology, size, inside)
+    for use, settings in size.library.items():
+        with step(f"ray job submit: the library's ao/{use}"):
+            datagen(topology, f"/library/ao/{use}", "procedural", *settings)
     with step("deepshade render: one more"):
         view = look(topology, size, inside)
     first, before = shaded(topology, view)

@@ -85,7 +85,8 @@ def test_paths_that_ray_writes_are_the_trainer_s(document: dict[str, Any]) -> No
     services = document["services"]
     for name in ("trainer", "ray-head", "ray-worker"):
         assert "rendered:/jobs/rendered" in services[name]["volumes"], name
-        assert any(v.startswith("shards:/shards") for v in services[name]["volumes"]), name
+        for kept in ("shards:/shards", "library:/library"):
+            assert any(v.startswith(kept) for v in services[name]["volumes"]), name
 
 
 def test_without_tokens_nothing_starts(root: Path, topology: ModuleType, tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ EPOCHS = 64
 BLENDS = (1.0, 0.8, 0.6, 0.4, 0.2)
 MARGIN = 0.35
 ROUNDS = 7  # of timing
+TIMINGS = 3  # at most, where the machine is too busy for one to show that a candidate is in time
 
 
 def finetune(plan: Plan, folder: Path) -> Iterator[Event]:
@@ -226,7 +227,7 @@ def _judge(plan: Plan, bundle: Bundle, parts: Parts, folder: Path) -> Verdict:
     tests = {name: pair for name, pair in pairs.items() if pair is not None}
     if not tests:
         raise _no_test(plan)
-    return Verdict(own, tests, speed(base, bundle), plan.worse, plan.slower)
+    return Verdict(own, tests, speed(base, bundle, plan.slower), plan.worse, plan.slower)
 
 
 def _pair(
@@ -244,10 +245,11 @@ def _pair(
     return Paired.of(errors[0], errors[1], noise)
 
 
-def speed(base: Bundle, bundle: Bundle) -> float:
+def speed(base: Bundle, bundle: Bundle, allowed: float) -> float:
     """Time of the bundle's network over the base's, each as requests would run it, in turns.
 
-    The shortest of each counts: whatever else runs only ever adds.
+    The shortest of each counts: whatever else runs only ever adds. Where that is over what is
+    `allowed`, they are timed again, `TIMINGS` times in all.
     """
     tasks = {}
     for name, each in (("base", base), ("candidate", bundle)):
@@ -255,8 +257,13 @@ def speed(base: Bundle, bundle: Bundle) -> float:
         sides = (up(side, each.size_multiple) for side in (bench.HEIGHT, bench.WIDTH))
         given = (black(each.environment),) if each.environment else ()
         tasks[name] = partial(engine.predict, bench.noise(each, *sides), *given)
-    times = alternate(tasks, Pace(0.0, min_rounds=ROUNDS))
-    return min(times["candidate"]["ms"]) / min(times["base"]["ms"])
+    least = dict.fromkeys(tasks, math.inf)
+    for _ in range(TIMINGS):
+        times = alternate(tasks, Pace(0.0, min_rounds=ROUNDS))
+        least = {name: min(least[name], *times[name]["ms"]) for name in tasks}
+        if least["candidate"] <= allowed * least["base"]:
+            break
+    return least["candidate"] / least["base"]
 
 
 def _tests(plan: Plan, folder: Path) -> dict[str, list[Path]]:
