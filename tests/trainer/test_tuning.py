@@ -22,6 +22,7 @@ from deepshade.manifest import Manifest
 from deepshade_trainer.dataset import Dataset
 from deepshade_trainer.run import Run
 from deepshade_trainer.tuning import events, shipped
+from deepshade_trainer.tuning import finetune as tuning
 from deepshade_trainer.tuning.finetune import finetune
 from deepshade_trainer.tuning.finished import candidate
 from deepshade_trainer.tuning.parts import Parts
@@ -63,6 +64,23 @@ def test_better_has_to_be_sure_and_to_cost_little() -> None:
         assert not found.better
         assert said in found.sentence()
         json.dumps(found.document(), allow_nan=False)
+
+
+@pytest.mark.parametrize(("slow", "timings", "ratio"), [(1, 2, 1.0), (9, 3, 1.5)])
+def test_a_candidate_that_seems_slow_is_timed_again(
+    monkeypatch: pytest.MonkeyPatch, slow: int, timings: int, ratio: float
+) -> None:
+    """Other work hits one timing; what is slow stays so."""
+    made = []
+
+    def alternate(tasks: Any, pace: Any) -> dict[str, dict[str, list[float]]]:
+        made.append(1.5 if len(made) < slow else 1.0)
+        return {"base": {"ms": [3.0, 2.0]}, "candidate": {"ms": [9.0, 2.0 * made[-1]]}}
+
+    monkeypatch.setattr(tuning, "alternate", alternate)
+    bundle = Bundle.load(Path(__file__).parents[2] / "models/ao/fast")
+    assert tuning.speed(bundle, bundle, 1.1) == ratio
+    assert len(made) == timings
 
 
 def test_what_judges_is_never_learnt_and_stays_when_views_come(tmp_path: Path) -> None:
