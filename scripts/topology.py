@@ -82,9 +82,7 @@ class Topology:
         self._folder, self._built = folder.resolve(), built
         self.running: dict[str, Running] = {}
         self._made: list[str] = []
-        self._bridge, self._net = self._free()
-        self._addresses = {name: f"10.{self._net}.0.{n + 10}" for n, name in enumerate(self._all())}
-        self.published = f"10.{self._net}.1.2"
+        self._bridge, self._net, self._addresses, self.published = "", 0, dict[str, str](), ""
 
     def _free(self) -> tuple[str, int]:
         """The bridge's namespace, and the N of 10.N.x.x: its name says that they are taken."""
@@ -100,6 +98,9 @@ class Topology:
 
     def __enter__(self) -> Self:
         self._folder.mkdir(parents=True, exist_ok=True)
+        self._bridge, self._net = self._free()
+        self._addresses = {name: f"10.{self._net}.0.{n + 10}" for n, name in enumerate(self._all())}
+        self.published = f"10.{self._net}.1.2"
         hosts = "".join(f"{address} {name}\n" for name, address in self._addresses.items())
         (self._folder / "hosts").write_text("127.0.0.1 localhost\n" + hosts)
         self._ip("link set lo up", of=self._bridge)
