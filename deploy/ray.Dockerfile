@@ -11,7 +11,7 @@ RUN /opt/deepshade/bin/pip install --no-cache-dir --no-compile -c constraints.tx
 
 FROM ${BASE}
 RUN apt-get update -qq && \
-    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends libllvm19 && \
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends libllvm19 libatomic1 && \
     rm -rf /var/lib/apt/lists/*
 RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin deepshade && \
     mkdir -p /jobs/rendered /shards /library && chown -R 10001:10001 /jobs /shards /library

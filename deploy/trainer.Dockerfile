@@ -17,7 +17,7 @@ RUN /opt/deepshade/bin/pip install --no-cache-dir --no-compile -c constraints.tx
 FROM ${BASE}
 # Mitsuba compiles with libLLVM, for jobs that render here rather than on Ray
 RUN apt-get update -qq && \
-    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends libllvm19 && \
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends libllvm19 libatomic1 && \
     rm -rf /var/lib/apt/lists/*
 RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin deepshade && \
     mkdir -p /models /jobs/rendered /shards /library && \

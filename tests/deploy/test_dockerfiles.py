@@ -53,6 +53,21 @@ def test_the_context_is_the_sources_and_no_more(root: Path, images: ModuleType) 
         assert {file for file in known if file.parts[0] in tops} <= set(files)
 
 
+@pytest.mark.parametrize("name", ["trainer", "ray"])
+def test_images_that_render_have_what_mitsuba_loads(root: Path, name: str) -> None:
+    """A slim Debian has the C and C++ libraries and zlib; each other one is installed by name."""
+    drjit = importlib.metadata.distribution("drjit").locate_file("drjit")
+    told = subprocess.run(["ldd", *Path(str(drjit)).glob("libdrjit-*.so")], capture_output=True)
+    needed = set(re.findall(r"^\s(lib\S+) => /(?:usr/)?lib/", told.stdout.decode(), re.MULTILINE))
+    assert needed, told.stderr
+    usual = {"libc.so.6", "libm.so.6", "libdl.so.2", "libpthread.so.0", "librt.so.1"}
+    usual |= {"libstdc++.so.6", "libgcc_s.so.1", "libz.so.1"}
+    text = (root / f"deploy/{name}.Dockerfile").read_text()
+    for library in needed - usual:
+        stem, _, version = library.partition(".so.")
+        assert f" {stem}{version} " in text, f"{library} is in no package that is installed"
+
+
 def test_images_hold_the_whole_wheel(wheel: zipfile.ZipFile) -> None:
     names = wheel.namelist()
     for each in ("deepshade/health.py", "deepshade_trainer/cli.py", "deepshade_workers/cli.py"):

@@ -14,7 +14,7 @@ from deepshade import exr
 from deepshade.attributes import ATTRIBUTES
 from deepshade.camera import Camera
 from deepshade.effects import EFFECTS
-from deepshade.errors import ConfigError, SceneError
+from deepshade.errors import ConfigError, DeepshadeError, SceneError
 from deepshade_workers import references
 from deepshade_workers.datagen import make_sample
 from deepshade_workers.dataspec import DataSpec
@@ -145,6 +145,16 @@ def test_background_is_the_sky_at_infinity() -> None:
     assert np.abs(images["view"] - toward)[:, outside].max() < 1e-6
     for name in set(ATTRIBUTES) - {"depth", "light", "focal", "view"}:
         assert (images[name][:, outside] == 0).all(), name
+
+
+def test_a_library_that_mitsuba_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small Debian has no libatomic, and Dr.Jit ends with a NameError."""
+    from deepshade_workers.backend import mitsuba
+
+    monkeypatch.setitem(sys.modules, "drjit", None)
+    with pytest.raises(DeepshadeError, match=r"Mitsuba can't be loaded.*drjit") as raised:
+        mitsuba.__wrapped__()
+    assert "libatomic1" in raised.value.fix
 
 
 def sky_map(path: Path) -> None:

@@ -17,14 +17,21 @@ def mitsuba() -> Any:
     """Import Mitsuba and set its variant: `cuda_ad_rgb` where there is a GPU, else `llvm_ad_rgb`.
 
     Raises:
-        DeepshadeError: there is neither an NVIDIA GPU nor a usable libLLVM.
+        DeepshadeError: there is neither an NVIDIA GPU nor a usable libLLVM, or Mitsuba's own
+            libraries lack another one (libatomic, where Debian is small).
     """
     library = find_libllvm()
     if library is not None:
         os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(library))
-    import drjit as dr
-    import mitsuba as mi
-
+    try:
+        import drjit as dr
+        import mitsuba as mi
+    except (ImportError, NameError) as error:  # Dr.Jit goes on to a NameError
+        raise DeepshadeError(
+            f"Mitsuba can't be loaded: {error.__context__ or error}",
+            fix="sudo apt-get install libatomic1, if that is the library; or pip install "
+            "--force-reinstall mitsuba",
+        ) from error
     gpu = dr.has_backend(dr.JitBackend.CUDA)
     if library is None and not gpu:
         raise DeepshadeError(

@@ -15,7 +15,7 @@ import numpy as np
 
 from deepshade import symmetry
 from deepshade.environments.stored import store, stored_path
-from deepshade.errors import ConfigError, DataError, SceneError
+from deepshade.errors import ConfigError, DataError, DeepshadeError, SceneError
 from deepshade.files import sha256
 from deepshade.manifest import NAME, Manifest, Shard
 from deepshade_workers.dataspec import DataSpec
@@ -234,12 +234,12 @@ class Tally:
 
 
 def _shard_task(spec: DataSpec, index: int, folder: str, home: str, tally: Any) -> Shard:
-    import drjit as dr
-
     from deepshade_workers.backend import mitsuba
 
     os.chdir(home)  # scenes may have relative names
-    mitsuba()
+    mitsuba()  # first: it says what is missing
+    import drjit as dr
+
     dr.set_thread_count(1)  # Ray gave this task one core
     counts = itertools.count(1)
     return make_shard(spec, index, Path(folder), lambda: tally.set.remote(index, next(counts)))
@@ -251,7 +251,7 @@ def _result(reference: Any) -> Shard:
     try:
         return cast(Shard, ray.get(reference))
     except ray.exceptions.RayTaskError as error:
-        raise error.cause if isinstance(error.cause, SceneError) else error from None
+        raise error.cause if isinstance(error.cause, DeepshadeError) else error from None
 
 
 def _connect(address: str | None) -> None:
