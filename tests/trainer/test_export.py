@@ -29,7 +29,7 @@ from deepshade_trainer.export import (
     write_onnx,
 )
 from deepshade_trainer.graph import bytes_per_pixel, float32_marks, session
-from deepshade_trainer.networks import from_bundle
+from deepshade_trainer.networks import Shader, build, from_bundle
 from deepshade_trainer.recipe import Recipe, preset
 from deepshade_trainer.run import Run
 from deepshade_trainer.training import train
@@ -144,6 +144,31 @@ def test_a_shipped_network_exports_as_it_was(tmp_path: Path) -> None:
     gbuffer[:, 5] = -gbuffer[:, 5].abs() - 3
     assert parity(shader, tmp_path / "model.onnx", [gbuffer]) <= 1e-5
     assert parity(shader, bundle.model, [gbuffer]) <= 1e-5
+
+
+def test_filters_that_are_not_learnt_stay_in_float32(tmp_path: Path) -> None:
+    """They calculate with lengths: 16 bits would begin after them, not before."""
+    network = {"widths": (8, 12), "steps": (2,), "down": (0, 1), "up": (1,), "detail": ()}
+    recipe = preset("balanced", "ao").changed(network={**network, "fine": 4})
+    torch.manual_seed(0)
+    shader = Shader(EFFECTS["ao"], build(recipe.network)).eval()
+    graph = write_onnx(shader, tmp_path / "model.onnx")
+    marks, after = float32_marks(graph, shader.network.rounded)
+    (fixed,) = [
+        node
+        for node in graph.graph.node
+        if node.op_type == "Conv" and not node.input[1].endswith(".weight")
+    ]
+    met = set(fixed.output)
+    for node in graph.graph.node:  # ONNX keeps them in order
+        if met.intersection(node.input) - set(marks):
+            assert node.op_type not in ("Conv", "ConvTranspose")
+            met.update(node.output)
+    assert met.intersection(marks)
+    assert after == []
+    gbuffer = torch.randn(1, 6, 64, 96, generator=torch.Generator().manual_seed(0))
+    gbuffer[:, 5] = -gbuffer[:, 5].abs() - 3
+    assert parity(shader, tmp_path / "model.onnx", [gbuffer]) <= 1e-5
 
 
 def test_an_empty_run_is_refused(tmp_path: Path) -> None:

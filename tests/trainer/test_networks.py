@@ -59,6 +59,18 @@ DETAILED = FoldConfig(
     fine_rings=(1,),
     detail=(9, 1),
 )
+FINE = FoldConfig(
+    **GEOMETRY,
+    widths=(8, 12),
+    steps=(2,),
+    down=(0, 1),
+    up=(1,),
+    fold=4,
+    rings=(1,),
+    fine_rings=(1, 1, 2),
+    detail=(),
+    fine=4,
+)
 RAW = FoldConfig(widths=(8, 12), steps=(2,), down=(1, 1), up=(1,), fold=2)
 CHAIN = ChainConfig(inputs=6)
 SMALL_PAPER = PaperConfig(u0=4, levels=3)
@@ -114,7 +126,7 @@ def test_the_papers_deconvolution_is_bilinear_but_for_the_pictures_edge() -> Non
     assert torch.allclose(found[inside], expected[inside], atol=1e-6)
 
 
-@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE, DETAILED, RAW, CHAIN])
+@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE, DETAILED, FINE, RAW, CHAIN])
 def test_a_pixel_beyond_the_halo_changes_nothing(config: NetworkConfig) -> None:
     model = awake(config)
     step, halo = model.size_multiple, model.halo
@@ -132,7 +144,7 @@ def test_a_pixel_beyond_the_halo_changes_nothing(config: NetworkConfig) -> None:
     assert reach > halo // 2  # the bound isn't loose; float32 hides the faintest influence
 
 
-@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE, DETAILED, RAW, CHAIN])
+@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER, WIDE, DETAILED, FINE, RAW, CHAIN])
 def test_the_receptive_field_is_exactly_what_gradients_reach(config: NetworkConfig) -> None:
     """Weights are positive and no rectifier clips: every path counts, so the bound must be met.
 
@@ -161,7 +173,7 @@ def test_the_receptive_field_is_exactly_what_gradients_reach(config: NetworkConf
         assert (int(columns.min()), int(columns.max())) == model.receptive_field(column)
 
 
-@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER])
+@pytest.mark.parametrize("config", [SMALL, FINE, SMALL_PAPER])
 def test_tiles_with_a_halo_equal_the_whole(config: NetworkConfig) -> None:
     model = awake(config)
     step = model.size_multiple
@@ -175,7 +187,7 @@ def test_tiles_with_a_halo_equal_the_whole(config: NetworkConfig) -> None:
     assert (inner - whole[:, :, step + halo : 2 * step + halo]).abs().max() < 1e-5
 
 
-@pytest.mark.parametrize("config", [SMALL, SMALL_PAPER])
+@pytest.mark.parametrize("config", [SMALL, FINE, SMALL_PAPER])
 def test_background_is_open(config: NetworkConfig) -> None:
     model = Shader(EFFECTS["ao"], awake(config)).eval()
     gbuffer = scene(64, 64)
@@ -186,9 +198,10 @@ def test_background_is_open(config: NetworkConfig) -> None:
     assert image.max() <= 1
 
 
+@pytest.mark.parametrize("config", [SMALL, FINE])
 @pytest.mark.parametrize("value", [0.0, 1e-20, 1e4, 1e18])
-def test_extreme_positions_stay_finite(value: float) -> None:
-    model = awake(SMALL)
+def test_extreme_positions_stay_finite(config: NetworkConfig, value: float) -> None:
+    model = awake(config)
     gbuffer = scene(64, 64)
     gbuffer[:, 3:] *= value
     with torch.inference_mode():
@@ -212,8 +225,9 @@ def test_far_translation_along_the_view_matters_little() -> None:
         assert (model(near) - model(far)).abs().max() < 1e-2
 
 
-def test_gradients_are_finite_on_background_and_degenerate_input() -> None:
-    model = build(SMALL).train()
+@pytest.mark.parametrize("config", [SMALL, FINE])
+def test_gradients_are_finite_on_background_and_degenerate_input(config: NetworkConfig) -> None:
+    model = build(config).train()
     gbuffer = scene(64, 64)
     gbuffer[:, 3:, 20:30] = 0
     model(gbuffer).square().mean().backward()

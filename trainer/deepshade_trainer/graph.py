@@ -232,8 +232,12 @@ def _known_sizes(model: Any) -> int:
 
 
 def _convolves(node: Any, rounded: str) -> bool:
-    """Whether it is a convolution whose weights' names begin with `rounded`."""
-    return node.op_type in CONVOLUTIONS and node.input[1].startswith(rounded)
+    """Whether it is a convolution of learnt weights, whose names begin with `rounded`.
+
+    A fixed filter, of which only a network's own weights have names, calculates with lengths.
+    """
+    name = node.input[1] if node.op_type in CONVOLUTIONS else ""
+    return bool(name.startswith(rounded) and name.endswith(".weight"))
 
 
 def _is_inner(node: Any, model: Any, rounded: str) -> bool:

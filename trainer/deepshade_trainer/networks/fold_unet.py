@@ -13,9 +13,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deepshade.errors import ConfigError
+from deepshade_trainer.networks.edges import edges, second_differences
 from deepshade_trainer.networks.horizons import covered, directions, horizons, sampled, unit
 from deepshade_trainer.networks.network import Network, check_types
 from deepshade_trainer.networks.receptive_field import Span, folded, grown, joined
+from deepshade_trainer.networks.stack import stack
 
 # Levels whose cells are this many pixels wide keep those without geometry at zero.
 _MASKED = 16
@@ -32,7 +34,8 @@ class FoldConfig:
     the way down and `up` on the way up. `normal` and `position` are the first of their three input
     channels; with both, every level is told its `horizons`, found `rings` cells away, the first
     `fine_rings`, and also those of its cells' quarters, `detail` quarters away, unless that is
-    empty. `bias` is what the outputs begin at.
+    empty. Where `fine` isn't 0, outputs are made of half as large cells of so many channels, which
+    are told the normals and `edges` of their pixels. `bias` is what the outputs begin at.
     """
 
     kind: str = "fold"
@@ -46,6 +49,7 @@ class FoldConfig:
     rings: tuple[int, ...] = (1, 1, 2, 2, 4, 4)
     fine_rings: tuple[int, ...] = (1, 1, 2, 3, 5, 8)
     detail: tuple[int, ...] = (1, 1)
+    fine: int = 0
     normal: int | None = None
     position: int | None = None
     bias: float = 0.0
@@ -66,6 +70,10 @@ class FoldConfig:
             raise ConfigError(
                 "detail", detail="detail are distances of 1 quarter or more, and need an even fold"
             )
+        if self.fine and (self.fold % 2 or self.normal is None or self.position is None):
+            raise ConfigError(
+                "fine", detail="fine cells need an even fold, and an effect of normals, positions"
+            )
 
 
 class FoldUNet(Network):
@@ -73,6 +81,7 @@ class FoldUNet(Network):
 
     With normals and positions each cell is told its horizons at every level: what occludes it;
     with `detail`, the finest also those of its four quarters, for what is thinner than a cell.
+    With `fine`, the answer is made to the pixel: what cells know meets where the pixels' edges are.
     They are float32 arithmetic before the first convolution, so that engines can run the
     convolutions in 16 bits while no large position ever matters to one. Nothing has a bias where
     there is no geometry, and coarse cells without geometry are kept at zero: to the pixels around
@@ -80,6 +89,8 @@ class FoldUNet(Network):
 
     Without normals or positions there are no horizons, and all inputs are raw.
     """
+
+    filters: Tensor  # of `edges`
 
     def __init__(self, config: FoldConfig) -> None:
         super().__init__()
@@ -100,7 +111,7 @@ class FoldUNet(Network):
             self.tell = nn.ModuleList(
                 nn.Conv2d(_TOLD + around, width, 1, bias=False) for width in widths[1:]
             )
-        self.encode = nn.ModuleList(map(_stack, widths, config.down))
+        self.encode = nn.ModuleList(map(stack, widths, config.down))
         pairs = list(zip(itertools.pairwise(widths), config.steps, strict=True))
         self.downsample = nn.ModuleList(
             nn.Conv2d(fine, coarse, step, stride=step, bias=False) for (fine, coarse), step in pairs
@@ -109,8 +120,16 @@ class FoldUNet(Network):
             nn.ConvTranspose2d(coarse, fine, step, stride=step, bias=False)
             for (fine, coarse), step in pairs
         )
-        self.decode = nn.ModuleList(map(_stack, widths[:-1], config.up))
-        self.head = nn.Conv2d(widths[0], config.outputs * fold**2, 3, padding=1)
+        self.decode = nn.ModuleList(map(stack, widths[:-1], config.up))
+        last, size = config.fine or widths[0], self._size
+        if config.fine:
+            filters = second_differences(size)
+            self.register_buffer("filters", filters, persistent=False)
+            self.fine_stem = nn.Conv2d(raw, last, size, stride=size, bias=False)
+            self.edge = nn.Conv2d(len(filters), last, 1, bias=False)
+            self.fine_upsample = nn.ConvTranspose2d(widths[0], last, 2, stride=2, bias=False)
+            self.fine = stack(last, 1)
+        self.head = nn.Conv2d(last, config.outputs * size**2, 3, padding=1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.bias, config.bias)  # type: ignore[arg-type]
 
@@ -125,13 +144,17 @@ class FoldUNet(Network):
         """The outputs (N, outputs, H, W), float32, of what `cells` made of a G-buffer."""
         # bf16 has only 1/256 between 0.5 and 1, where most of an occlusion image lies.
         with full_precision():
-            x = self.head(x.to(self.head.weight.dtype)).float()  # (N, outputs fold², h, w)
-            return F.pixel_shuffle(x, self.config.fold)
+            x = self.head(x.to(self.head.weight.dtype)).float()  # (N, outputs size², h, w)
+            return F.pixel_shuffle(x, self._size)
 
     def cells(self, gbuffer: Tensor, first: int = 0) -> Tensor:
-        """All but the last convolution: (N, C, H, W) to (N, widths[0], H / fold, W / fold)."""
+        """All but the last convolution: (N, C, H, W) to (N, widths[0], H / fold, W / fold).
+
+        With `fine` that is (N, fine, 2 H / fold, 2 W / fold).
+        """
         config = self.config
-        x = self._stem(gbuffer, first)  # (N, widths[0], H / fold, W / fold)
+        raw = self._raw(gbuffer, first)
+        x = _folded(raw, self.stem)  # (N, widths[0], H / fold, W / fold)
         told: list[Tensor] = []
         masks: list[Tensor | None] = [None] * len(config.widths)
         if self.geometric:
@@ -142,34 +165,39 @@ class FoldUNet(Network):
                 x = x + self.detail(nearest)
         x = F.relu(x)
         skips = []
-        for n, stack in enumerate(self.encode):
+        for n, convolutions in enumerate(self.encode):
             if n:
                 x = self.downsample[n - 1](x)  # (N, widths[n], h / step, w / step)
                 x = F.relu(x + self.tell[n - 1](told[n - 1]) if told else x)
-            x = stack(x, masks[n])
+            x = convolutions(x, masks[n])
             skips.append(x)
         for n in reversed(range(len(self.decode))):
             x = F.relu(skips[n] + self.upsample[n](x))  # (N, widths[n], step h, step w)
             x = self.decode[n](x, masks[n])
+        if config.fine:
+            depth = first + (config.position or 0) + 2
+            with full_precision():
+                edge = edges(gbuffer[:, depth : depth + 1], self._size, self.filters)
+            x = self.fine_upsample(x) + _folded(raw, self.fine_stem) + self.edge(edge)
+            x = self.fine(F.relu(x), None)
         return x
 
-    def _stem(self, gbuffer: Tensor, first: int) -> Tensor:
-        """All but positions, folded: (N, C, H, W) to (N, widths[0], H / fold, W / fold)."""
-        raw, weight, place = gbuffer, self.stem.weight, self.config.position or 0
-        if self.geometric and place + 3 == self.config.inputs:
+    def _raw(self, gbuffer: Tensor, first: int) -> Tensor:
+        """All but positions, and what else may come with them (see `_folded`): (N, C, H, W)."""
+        place = self.config.position or 0
+        if not self.geometric:
+            return gbuffer
+        if place + 3 == self.config.inputs:
             # All that is raw comes first. An odd number of channels would be slower in 16 bits.
-            raw = gbuffer[:, first : first + place + place % 2]
-            if weight.shape[1] < raw.shape[1]:
-                weight = F.pad(weight, (0, 0, 0, 0, 0, 1))
-        elif self.geometric:
-            raw = torch.cat([gbuffer[:, :place], gbuffer[:, place + 3 :]], 1)
-        return F.conv2d(raw, weight, stride=self.config.fold)
+            return gbuffer[:, first : first + place + place % 2]
+        return torch.cat([gbuffer[:, :place], gbuffer[:, place + 3 :]], 1)
 
     def prepare_export(self) -> None:
-        """Pad the stem's weights where `_stem` does: the graph then holds them by their name."""
+        """Pad the stems' weights where `_folded` does: the graph then holds them by their name."""
         place = self.config.position or 0
         if self.geometric and place + 3 == self.config.inputs and place % 2:
-            self.stem.weight = nn.Parameter(F.pad(self.stem.weight, (0, 0, 0, 0, 0, 1)))
+            for stem in [self.stem, *([self.fine_stem] if self.config.fine else [])]:
+                stem.weight = nn.Parameter(F.pad(stem.weight, (0, 0, 0, 0, 0, 1)))
 
     def features(
         self, gbuffer: Tensor, first: int = 0
@@ -213,20 +241,28 @@ class FoldUNet(Network):
         return self._sizes[-1]
 
     @property
+    def _size(self) -> int:
+        """Pixels along the side of a cell that outputs are made of."""
+        return self.config.fold // 2 if self.config.fine else self.config.fold
+
+    @property
     def _sizes(self) -> list[int]:
         """Pixels along a cell's side, at each level."""
         return list(itertools.accumulate(self.config.steps, operator.mul, initial=self.config.fold))
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        config = self.config
-        span = grown((pixel // config.fold, pixel // config.fold), 1)
+        config, pixels = self.config, (pixel, pixel)
+        span = grown((pixel // self._size, pixel // self._size), 1)
+        if config.fine:
+            span = grown(span, 1)
+            pixels = grown(folded(span, self._size), 1)
+            span = span[0] // 2, span[1] // 2
         skips = []
         for step, count in zip(config.steps, config.up, strict=True):
             span = grown(span, count)
             skips.append(span)
             span = span[0] // step, span[1] // step
-        pixels = (pixel, pixel)
         for n in reversed(range(len(config.widths))):
             if n < len(skips):
                 span = joined(folded(span, config.steps[n]), skips[n])
@@ -254,30 +290,12 @@ def _seen(six: Tensor) -> Tensor:
     return torch.cat([unit(normal), position, covered(position[:, 2:])], 1)
 
 
-class Stack(nn.ModuleList):
-    """3 x 3 convolutions without biases, each followed by ReLU; kept at zero where `mask` is.
-
-    Masking before every second one is enough that what leaks out of a cell with geometry comes
-    back only through cells next to one.
-    """
-
-    def forward(self, x: Tensor, mask: Tensor | None) -> Tensor:
-        """(N, C, H, W) to the same; `mask` (N, 1, H, W)."""
-        for k, convolution in enumerate(self):
-            if mask is not None and k % 2 == 0:
-                x = x * mask.to(x.dtype)
-            x = F.relu(convolution(x))
-        return x
-
-
-def _stack(width: int, count: int) -> Stack:
-    """Convolutions that begin as the identity plus noise, as residual ones do, at no cost."""
-    stack = Stack(nn.Conv2d(width, width, 3, padding=1, bias=False) for _ in range(count))
-    for weight in stack.parameters():
-        nn.init.dirac_(weight)
-        with torch.no_grad():
-            weight.add_(torch.randn_like(weight), alpha=0.3 * (2 / (9 * width)) ** 0.5)
-    return stack
+def _folded(raw: Tensor, stem: nn.Conv2d) -> Tensor:
+    """`stem` of its channels of `raw`, which may have one more."""
+    weight = stem.weight
+    if weight.shape[1] < raw.shape[1]:
+        weight = F.pad(weight, (0, 0, 0, 0, 0, 1))
+    return F.conv2d(raw, weight, stride=stem.stride)
 
 
 @contextmanager

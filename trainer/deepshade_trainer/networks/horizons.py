@@ -60,13 +60,18 @@ def horizons(cells: Tensor, rings: Sequence[int], together: bool = False) -> Ten
         )
         square = (x * x + y * y + z * z).clamp(1e-6, 4)  # beyond, all has faded anyway
         inverse = torch.rsqrt(square)
-        near = ((square * inverse) * -_FADE + _GONE * _FADE).clamp(0, 1)
+        near = faded(square * inverse)
         rise = x * normal[0] + y * normal[1] + z * normal[2]
         found.append(F.relu(rise * inverse * near))
     if together:
         found = list(torch.split(found[0], 4, 1))
     turn = directions(rings) // (4 if together else 1)
     return torch.cat([reduce(torch.maximum, found[k::turn]) for k in range(turn)], 1)
+
+
+def faded(distance: Tensor) -> Tensor:
+    """How much what is so many effect radii away counts, in [0, 1]."""
+    return (distance * -_FADE + _GONE * _FADE).clamp(0, 1)
 
 
 def _cut(wide: Tensor, margin: int, down: int, right: int) -> Tensor:
