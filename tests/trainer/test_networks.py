@@ -10,6 +10,7 @@ import torch
 from torch.nn import functional as F
 
 from deepshade.effects import EFFECTS
+from deepshade.errors import ConfigError
 from deepshade_trainer.networks import FoldConfig, Network, NetworkConfig, Shader, build
 from deepshade_trainer.networks.chain import ChainConfig
 from deepshade_trainer.networks.paper_unet import PaperConfig
@@ -74,6 +75,14 @@ FINE = FoldConfig(
 RAW = FoldConfig(widths=(8, 12), steps=(2,), down=(1, 1), up=(1,), fold=2)
 CHAIN = ChainConfig(inputs=6)
 SMALL_PAPER = PaperConfig(u0=4, levels=3)
+
+
+@pytest.mark.parametrize("wrong", [{"fine": -4}, {"fine": 4, "fold": 1, "detail": ()}])
+def test_fine_cells_that_no_network_could_have_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="fine"):
+        FoldConfig(**{**GEOMETRY, **wrong})
+    with pytest.raises(ConfigError, match="normals and positions"):
+        FoldConfig(fine=4)
 
 
 def awake(config: NetworkConfig, seed: int = 0) -> Network:

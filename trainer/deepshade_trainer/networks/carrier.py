@@ -10,8 +10,8 @@ from torch import Tensor
 
 from deepshade.errors import ConfigError
 from deepshade_trainer.networks.bases import BASES
-from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
-from deepshade_trainer.networks.network import Network, check_types
+from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet
+from deepshade_trainer.networks.network import Network, check_types, full_precision
 from deepshade_trainer.networks.receptive_field import Span, folded, joined
 
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from deepshade_trainer.networks.fold_unet import full_precision
-from deepshade_trainer.networks.network import Network
+from deepshade_trainer.networks.network import Network, full_precision
 from deepshade_trainer.networks.receptive_field import Span, doubled, folded, grown, joined
 
 # Radii of blur in pixels: what lies between two of them is shared out to both. Below the first

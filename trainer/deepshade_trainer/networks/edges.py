@@ -1,8 +1,7 @@
 """Where a pixel's depth leaves the plane of its neighbours: edges, cracks and bars, to the pixel.
 
 Over the picture, 1/z of a plane is linear whatever its slope, so second differences of 1/z are zero
-on it. Relative to 1/z they are steps in depth relative to the distance, as in depth-aware filters
-everywhere; here a network is told them.
+on it. Times z they are steps in depth, in shares of the distance.
 """
 
 from __future__ import annotations

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import operator
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -15,9 +13,9 @@ from torch.nn import functional as F
 from deepshade.errors import ConfigError
 from deepshade_trainer.networks.edges import edges, second_differences
 from deepshade_trainer.networks.horizons import covered, directions, horizons, sampled, unit
-from deepshade_trainer.networks.network import Network, check_types
+from deepshade_trainer.networks.network import Network, check_types, full_precision
 from deepshade_trainer.networks.receptive_field import Span, folded, grown, joined
-from deepshade_trainer.networks.stack import stack
+from deepshade_trainer.networks.stack import Stack
 
 # Levels whose cells are this many pixels wide keep those without geometry at zero.
 _MASKED = 16
@@ -70,10 +68,10 @@ class FoldConfig:
             raise ConfigError(
                 "detail", detail="detail are distances of 1 quarter or more, and need an even fold"
             )
+        if self.fine < 0:
+            raise ConfigError("fine", detail="fine is a number of channels, or 0 for none")
         if self.fine and (self.fold % 2 or self.normal is None or self.position is None):
-            raise ConfigError(
-                "fine", detail="fine cells need an even fold, and an effect of normals, positions"
-            )
+            raise ConfigError("fine", detail="fine needs an even fold, normals and positions")
 
 
 class FoldUNet(Network):
@@ -111,7 +109,7 @@ class FoldUNet(Network):
             self.tell = nn.ModuleList(
                 nn.Conv2d(_TOLD + around, width, 1, bias=False) for width in widths[1:]
             )
-        self.encode = nn.ModuleList(map(stack, widths, config.down))
+        self.encode = nn.ModuleList(map(Stack, widths, config.down))
         pairs = list(zip(itertools.pairwise(widths), config.steps, strict=True))
         self.downsample = nn.ModuleList(
             nn.Conv2d(fine, coarse, step, stride=step, bias=False) for (fine, coarse), step in pairs
@@ -120,7 +118,7 @@ class FoldUNet(Network):
             nn.ConvTranspose2d(coarse, fine, step, stride=step, bias=False)
             for (fine, coarse), step in pairs
         )
-        self.decode = nn.ModuleList(map(stack, widths[:-1], config.up))
+        self.decode = nn.ModuleList(map(Stack, widths[:-1], config.up))
         last, size = config.fine or widths[0], self._size
         if config.fine:
             filters = second_differences(size)
@@ -128,7 +126,7 @@ class FoldUNet(Network):
             self.fine_stem = nn.Conv2d(raw, last, size, stride=size, bias=False)
             self.edge = nn.Conv2d(len(filters), last, 1, bias=False)
             self.fine_upsample = nn.ConvTranspose2d(widths[0], last, 2, stride=2, bias=False)
-            self.fine = stack(last, 1)
+            self.fine = Stack(last, 1)
         self.head = nn.Conv2d(last, config.outputs * size**2, 3, padding=1)
         nn.init.normal_(self.head.weight, std=0.01)
         nn.init.constant_(self.head.bias, config.bias)  # type: ignore[arg-type]
@@ -165,11 +163,11 @@ class FoldUNet(Network):
                 x = x + self.detail(nearest)
         x = F.relu(x)
         skips = []
-        for n, convolutions in enumerate(self.encode):
+        for n, stack in enumerate(self.encode):
             if n:
                 x = self.downsample[n - 1](x)  # (N, widths[n], h / step, w / step)
                 x = F.relu(x + self.tell[n - 1](told[n - 1]) if told else x)
-            x = convolutions(x, masks[n])
+            x = stack(x, masks[n])
             skips.append(x)
         for n in reversed(range(len(self.decode))):
             x = F.relu(skips[n] + self.upsample[n](x))  # (N, widths[n], step h, step w)
@@ -179,7 +177,7 @@ class FoldUNet(Network):
             with full_precision():
                 edge = edges(gbuffer[:, depth : depth + 1], self._size, self.filters)
             x = self.fine_upsample(x) + _folded(raw, self.fine_stem) + self.edge(edge)
-            x = self.fine(F.relu(x), None)
+            x = self.fine(F.relu(x))
         return x
 
     def _raw(self, gbuffer: Tensor, first: int) -> Tensor:
@@ -296,10 +294,3 @@ def _folded(raw: Tensor, stem: nn.Conv2d) -> Tensor:
     if weight.shape[1] < raw.shape[1]:
         weight = F.pad(weight, (0, 0, 0, 0, 0, 1))
     return F.conv2d(raw, weight, stride=stem.stride)
-
-
-@contextmanager
-def full_precision() -> Iterator[None]:
-    """No automatic 16-bit arithmetic inside."""
-    with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
-        yield

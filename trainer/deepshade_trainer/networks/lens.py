@@ -9,9 +9,9 @@ from torch import Tensor
 
 from deepshade.tensors import channel_slices
 from deepshade_trainer.networks.discs import Discs
-from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
+from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet
 from deepshade_trainer.networks.horizons import covered
-from deepshade_trainer.networks.network import Network
+from deepshade_trainer.networks.network import Network, full_precision
 from deepshade_trainer.networks.receptive_field import Span, joined
 from deepshade_trainer.networks.reflections import ATTRIBUTES as SURFACE
 from deepshade_trainer.networks.reflections import Reflections

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -77,3 +78,10 @@ def check_types(settings: Any) -> None:
             raise ConfigError(
                 field.name, detail=f"{field.name} can't be {value!r}, it is like {default!r}"
             )
+
+
+@contextmanager
+def full_precision() -> Iterator[None]:
+    """No automatic 16-bit arithmetic inside."""
+    with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+        yield

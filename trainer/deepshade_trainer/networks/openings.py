@@ -12,9 +12,9 @@ from torch.nn import functional as F
 
 from deepshade.tensors import channel_slices
 from deepshade_trainer.networks import slices
-from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet, full_precision
+from deepshade_trainer.networks.fold_unet import FoldConfig, FoldUNet
 from deepshade_trainer.networks.horizons import covered, unit
-from deepshade_trainer.networks.network import Network, constant
+from deepshade_trainer.networks.network import Network, constant, full_precision
 from deepshade_trainer.networks.receptive_field import Span, folded, grown, joined
 from deepshade_trainer.networks.reflections import blurred, mean, turned
 
