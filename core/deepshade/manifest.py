@@ -7,14 +7,10 @@ unfinished.
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
-
-from numpy.typing import NDArray
 
 from deepshade.errors import DataError
 from deepshade.files import replacing
@@ -103,21 +99,3 @@ def shard_path(folder: Path, shard: Shard) -> Path:
     if Path(shard.file).name != shard.file:
         raise DataError(f"the manifest names {shard.file!r}, which is not in its folder")
     return folder / shard.file
-
-
-def write_shard(
-    folder: Path, file: str, tensors: Mapping[str, NDArray[Any]], records: list[dict[str, Any]]
-) -> Shard:
-    """Write a shard's tensors (samples, C, H, W) and records; the manifest doesn't name it yet.
-
-    The same input gives the same bytes.
-    """
-    import numpy as np
-    from safetensors.numpy import save
-
-    # in C order, or safetensors would write the numbers in another one
-    ordered = {name: np.ascontiguousarray(tensors[name]) for name in sorted(tensors)}
-    content = save(ordered, metadata={"samples": json.dumps(records, sort_keys=True)})
-    with replacing(folder / file) as temporary:
-        temporary.write_bytes(content)
-    return Shard(file, hashlib.sha256(content).hexdigest(), records)

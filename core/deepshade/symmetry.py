@@ -19,13 +19,6 @@ ALL = tuple(range(8))
 ROTATIONS = (0, 3, 5, 6)
 
 
-def inverse(symmetry: int) -> int:
-    """The symmetry that undoes this one."""
-    if not symmetry & 4:
-        return symmetry
-    return 4 | (symmetry & 1) << 1 | (symmetry & 2) >> 1  # rows are columns by then
-
-
 def apply(image: NDArray[Any], attribute: str | None, symmetry: int) -> NDArray[Any]:
     """Apply `symmetry` (0 to 7) to planar images (..., C, H, W).
 

@@ -78,10 +78,3 @@ def test_rotations_are_the_turns_that_mirror_nothing() -> None:
 def test_unknown_symmetries_are_refused() -> None:
     with pytest.raises(ValueError, match="0 to 7"):
         symmetry.apply(np.zeros((1, 2, 2)), None, 8)
-
-
-@pytest.mark.parametrize("turn", symmetry.ALL)
-def test_inverses_undo(turn: int) -> None:
-    position, _ = bumpy()
-    there = symmetry.apply(position, "position", turn)
-    assert (symmetry.apply(there, "position", symmetry.inverse(turn)) == position).all()

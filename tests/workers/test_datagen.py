@@ -28,7 +28,7 @@ from deepshade.effects import EFFECTS
 from deepshade.environments.stored import read_stored, stored_path
 from deepshade.errors import ConfigError, DataError, SceneError
 from deepshade.files import sha256
-from deepshade.manifest import Manifest, Shard, write_shard
+from deepshade.manifest import Manifest, Shard
 from deepshade_workers.datagen import _complete, generate, make_sample, make_shard, open_manifest
 from deepshade_workers.dataspec import DataSpec, default_shard_size, expand_scenes
 from deepshade_workers.maps import MAX_HEIGHT
@@ -36,7 +36,7 @@ from deepshade_workers.records import view_of
 from deepshade_workers.render import render_sample
 from deepshade_workers.scenes.loading import open_scene
 from deepshade_workers.scenes.procedural import FAMILIES
-from deepshade_workers.shards import schema, shard_name, stacked
+from deepshade_workers.shards import schema, write_shard
 from deepshade_workers.view import View
 
 from ..faults import full_disk
@@ -128,7 +128,7 @@ def test_shards_hold_light_and_lengths(tmp_path: Path) -> None:
     bright = {
         name: np.full(t["shape"], 1.0 + 7e4 * (name not in narrow)) for name, t in tensors.items()
     }
-    write_shard(tmp_path, shard_name(0), stacked(tensors, [bright]), [{}])
+    write_shard(tmp_path, 0, tensors, [bright], [{}])
     found = load_file(tmp_path / "shard-00000.safetensors")
     for name in ("light", "scatter", "position", "reference_sss", "reference_sss_error"):
         assert (found[name] == 70_001).all()

@@ -8,7 +8,6 @@ import pytest
 from deepshade import circles as places
 from deepshade.camera import Camera
 from deepshade.errors import ConfigError
-from deepshade.manifest import write_shard
 from deepshade_workers.circles import render_circles, view_around
 from deepshade_workers.datagen import make_sample
 from deepshade_workers.dataspec import DataSpec
@@ -17,7 +16,7 @@ from deepshade_workers.scenes.mesh import Mesh, merge
 from deepshade_workers.scenes.procedural import FAMILIES
 from deepshade_workers.scenes.procedural.primitives import box, place, turn_y
 from deepshade_workers.scenes.scene import Scene
-from deepshade_workers.shards import circle_schema, shard_name, stacked
+from deepshade_workers.shards import circle_schema, write_shard
 from deepshade_workers.view import View
 
 
@@ -82,8 +81,7 @@ def test_shards_hold_numbers_in_the_order_of_their_shapes(tmp_path):
         "reference_ao": np.zeros((1, 1, 5), np.float32),
         "reference_ao_error": np.zeros((1, 1, 5), np.float32),
     }
-    tensors = stacked(circle_schema(["ao"], 5), [images, images])
-    shard = write_shard(tmp_path, shard_name(0), tensors, [{}, {}])
+    shard = write_shard(tmp_path, 0, circle_schema(["ao"], 5), [images, images], [{}, {}])
     found = load_file(tmp_path / shard.file)["normal_object"]
     assert (found == turned.astype(np.float16)).all()
 

@@ -1,4 +1,4 @@
-"""`deepshade train`, `distill`, `evaluate` and `export`."""
+"""`deepshade train`, `evaluate` and `export`."""
 
 from __future__ import annotations
 
@@ -81,36 +81,6 @@ def _figures(progress: Progress) -> str:
         f"step {progress.step}: {loss}held-out DSSIM {found['dssim']:.4f} "
         f"({found['ratio']:.3f} x the trivial answer's)  MAE {found['mae']:.4f}"
     )
-
-
-def distill(
-    bundle: Annotated[Path, typer.Argument(help="Bundle that teaches, such as models/ao/best.")],
-    data: Annotated[Path, typer.Option(help="Data folder of 'deepshade datagen'.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Data folder to write.")],
-    engine: Annotated[str, typer.Option(help="onnxruntime, openvino, …")] = "onnxruntime",
-    precision: Annotated[str, typer.Option(help="fp32, bf16 or int8.")] = "fp32",
-) -> None:
-    """Write data anew with a bundle's answers as references, for a smaller network to learn from.
-
-    The bundle sees each view turned all ways, and its answers are averaged: less noise than rays
-    have, and less error than it makes by itself. Train on both folders. Ctrl-C loses a shard at
-    most; the same command goes on.
-
-    Examples:
-
-    deepshade distill models/ao/best --data data/ao --out data/ao-taught
-
-    deepshade train ao --preset fast --data data/ao --data data/ao-taught --out runs/fast
-    """
-    from deepshade.bundles import Bundle
-    from deepshade.console import Watch
-    from deepshade.engines import Backend
-    from deepshade_trainer.distillation import distill as teach
-
-    with Watch("teaching", "views") as watch:
-        for done, total in teach(Bundle.load(bundle), data, out, Backend(engine, precision)):
-            watch.update(done, total)
-    typer.echo(f"the data is in {out}")
 
 
 def evaluate(

@@ -33,8 +33,6 @@ HALF_LENGTHS = 0.3
 # Shares of samples whose directions are too short, as interpolation and filtering leave them.
 SHORT_DIRECTIONS = 0.3
 MIN_DIRECTION = 0.8
-# What a sample's record names where a bundle's answer is its reference: see `distillation`.
-TEACHER = "teacher"
 # Share of a single scene's views that are validated on, at least.
 HELD_VIEWS = 0.125
 
@@ -107,7 +105,7 @@ class Dataset:
 
         Scenes are held out by a hash of their name and the run's seed, so more data doesn't move
         them; with a `fraction` above 0 at least one is. Of a single scene views are held out
-        alike, at least `HELD_VIEWS` of all. What a bundle teaches is never validated on.
+        alike, at least `HELD_VIEWS` of all.
         """
         names = [str(entry.record["scene"]) for entry in self.entries]
         if self.one_scene:
@@ -118,8 +116,7 @@ class Dataset:
             fraction = max(fraction, float(np.nextafter(min(hashes), 1)))
         held = [value < fraction for value in hashes]
         training = [k for k, out in enumerate(held) if not out]
-        taught = [TEACHER in entry.record for entry in self.entries]
-        return training, [k for k, out in enumerate(held) if out and not taught[k]]
+        return training, [k for k, out in enumerate(held) if out]
 
     @property
     def one_scene(self) -> bool:

@@ -17,10 +17,10 @@ from deepshade import symmetry
 from deepshade.environments.stored import store, stored_path
 from deepshade.errors import ConfigError, DataError, DeepshadeError, SceneError
 from deepshade.files import sha256
-from deepshade.manifest import NAME, Manifest, Shard, write_shard
+from deepshade.manifest import NAME, Manifest, Shard
 from deepshade_workers.dataspec import DataSpec
 from deepshade_workers.scenes.loading import is_unseeded
-from deepshade_workers.shards import shard_name, stacked
+from deepshade_workers.shards import shard_name, write_shard
 from deepshade_workers.view import Images, Vector, View
 
 # How often a sample whose scene shows nothing useful may ask for another scene.
@@ -123,7 +123,7 @@ def make_shard(spec: DataSpec, index: int, folder: Path, tick: Callable[[], obje
             images.append({name: symmetry.apply(sample[name], name, turn) for name in tensors})
             records.append({**record, "turn": turn} if spec.augment else record)
         tick()
-    return write_shard(folder, shard_name(index), stacked(tensors, images), records)
+    return write_shard(folder, index, tensors, images, records)
 
 
 def open_manifest(spec: DataSpec, folder: Path) -> Manifest:

@@ -1,16 +1,20 @@
-"""What memory-mappable shards hold of rendered samples."""
+"""Writes rendered samples as memory-mappable shards."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deepshade.attributes import ATTRIBUTES
 from deepshade.circles import POINTS
 from deepshade.effects import EFFECTS
+from deepshade.files import replacing
+from deepshade.manifest import Shard
 from deepshade_workers.view import Images
 
 
@@ -46,11 +50,25 @@ def shard_name(index: int) -> str:
     return f"shard-{index:05d}.safetensors"
 
 
-def stacked(
-    tensors: Mapping[str, dict[str, Any]], images: Sequence[Images]
-) -> dict[str, NDArray[Any]]:
-    """Of each of `images` the planar (C, H, W) `tensors` of a `schema`, as a shard holds them."""
-    return {
-        name: np.stack([sample[name] for sample in images]).astype(tensors[name]["dtype"])
-        for name in tensors
+def write_shard(
+    folder: Path,
+    index: int,
+    tensors: Mapping[str, dict[str, Any]],
+    images: Sequence[Images],
+    records: list[dict[str, Any]],
+) -> Shard:
+    """Write shard `index`: of each of `images` the planar (C, H, W) `tensors` of a `schema`.
+
+    The same input gives the same bytes.
+    """
+    from safetensors.numpy import save
+
+    stacked = {  # in C order, or safetensors would write the numbers in another one
+        name: np.stack([sample[name] for sample in images]).astype(tensors[name]["dtype"], "C")
+        for name in sorted(tensors)
     }
+    content = save(stacked, metadata={"samples": json.dumps(records, sort_keys=True)})
+    name = shard_name(index)
+    with replacing(folder / name) as temporary:
+        temporary.write_bytes(content)
+    return Shard(name, hashlib.sha256(content).hexdigest(), records)
