@@ -38,11 +38,12 @@ def test_the_card_is_of_the_figures(folder: Path) -> None:
     ],
 )
 def test_readme_says_what_the_cards_of_ao_say(row: str, machine: str) -> None:
-    said = re.search(rf"\| {re.escape(row)} \| bf16 \| ([\d. /]+) \|", README)
+    said = re.search(rf"\| {re.escape(row)} \| bf16 \| ([-\d. /]+) \|", README)
     assert said is not None
     for name, text in zip(("fast", "balanced", "best"), said[1].split(" / "), strict=True):
-        digits = len(text.partition(".")[2])
-        assert text == f"{speeds(ROOT / 'models/ao' / name)[machine]['openvino/bf16']:.{digits}f}"
+        known, digits = speeds(ROOT / "models/ao" / name), len(text.partition(".")[2])
+        timed = f"{known[machine]['openvino/bf16']:.{digits}f}" if machine in known else "-"
+        assert text == timed
 
 
 def test_the_page_of_effects_says_what_the_cards_say() -> None:

@@ -17,17 +17,8 @@ PRESETS = {
             "bias": _BIAS,
         }
     },
-    "balanced": {"network": {"bias": _BIAS}},
-    "best": {
-        "network": {
-            "widths": (64, 96, 128, 160),
-            "steps": (2, 2, 2),
-            "down": (1, 2, 3, 3),
-            "up": (2, 2, 3),
-            "fine_rings": (1, 1, 2, 2, 4, 4, 8, 8),
-            "bias": _BIAS,
-        }
-    },
+    "balanced": {"network": {"down": (1, 1, 2), "up": (1, 1), "fine": 16, "bias": _BIAS}},
+    "best": {"network": {"fine": 48, "bias": _BIAS}},
     **{
         f"mlp-{a}x{b}": {
             "network": {"kind": "perceptron", "widths": (a, b)},
