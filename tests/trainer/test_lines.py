@@ -95,6 +95,15 @@ def test_a_moving_half_covers_a_ramp(near: bool) -> None:
     assert (shaded - ramp).abs().max() < 0.13  # a moment is 1/8
 
 
+def test_stripes_that_move_fade_though_moments_fall_on_each_alike() -> None:
+    """Stripes of 4 pixels move 32: eight moments at every pixel would keep them as they are."""
+    gbuffer = torch.zeros(1, 6, 32, 128)
+    gbuffer[:, 0], gbuffer[:, 5] = 32.0, 1.0
+    gbuffer[..., 2:5, :, :] = (torch.arange(128) % 4 < 2).float()
+    shaded = _shaded(gbuffer)[0, :, :, 32:96]
+    assert (shaded - 0.5).abs().max() < 0.26
+
+
 def test_a_firefly_changes_only_its_line() -> None:
     gbuffer = torch.rand(1, 6, 64, 96)
     gbuffer[:, 0], gbuffer[:, 1], gbuffer[:, 5] = 20.0, 0.0, 1.0

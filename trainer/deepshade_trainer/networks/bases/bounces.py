@@ -6,8 +6,9 @@ sees 24 directions. The sector that a point newly raises above the horizon so fa
 light (B. Mayaux, *Horizon-Based Indirect Lighting*, 2018; slices through the view as in J. Jimenez,
 X. Wu, A. Pesce and A. Jarabo, *Practical Real-Time Strategies for Accurate Indirect Occlusion*,
 2016). A sector's ∫ ω dω has a closed form, so that a cell carries each colour's vector irradiance
-(J. Arvo, *The Irradiance Jacobian for Partially Occluded Polyhedral Sources*, 1994), and every
-pixel takes from it by its own normal.
+(J. Arvo, *The Irradiance Jacobian for Partially Occluded Polyhedral Sources*, 1994). Every pixel
+takes from the nearest cells that lie on its surface (J. Kopf, M. Cohen, D. Lischinski and
+M. Uyttendaele, *Joint Bilateral Upsampling*, 2007), by its own normal.
 
 Two networks correct that, and both begin with nothing to correct: one along each ray, which is
 told all of its points and scales their light (thin things, surfaces that face away, what hides
@@ -26,6 +27,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deepshade_trainer.networks.bases.base import Bases, State
+from deepshade_trainer.networks.bases.cells import enlarged, smoothed
 from deepshade_trainer.networks.horizons import covered, sampled, unit
 from deepshade_trainer.networks.receptive_field import Span, folded, grown
 
@@ -56,9 +58,6 @@ _STEP = 0.25
 _GONE, _FADE = 1.7, 4.0
 # ∫ √(1 - c²) dc, an odd polynomial in c to 0.002.
 _ARC = (0.9943, -0.1293, -0.0776)
-# Neighbours count less by this much times the squared sine of how far off the tangent plane they
-# lie.
-_BENT = 4.0
 # How far apart two angles' cosines may be, for the sine of what lies between them.
 _CHORD = 1.2
 _PLACES = [(ray, phase) for ray in range(RAYS) for phase in range(_PHASES)]
@@ -97,7 +96,9 @@ class Bounces(Bases):
         cells = sampled(six, CELL)
         directions, places = unit(cells[:, :3]), cells[:, 3:]
         carried = self._gathered(directions, places, _spread(pooled))
-        return six, (unit(normal), _smoothed(carried, directions, places))
+        normal = unit(normal)
+        state = torch.cat([normal, position], 1), torch.cat([directions, places], 1)
+        return six, (*state, smoothed(carried, directions, places))
 
     def _gathered(self, normal: Tensor, position: Tensor, lights: Sequence[Tensor]) -> Tensor:
         """What cells receive (N, 15, h, w) of the light of others (N, 3, h, w), at each ring.
@@ -181,15 +182,14 @@ class Bounces(Bases):
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
-        normal, cells = state
+        pixels, surface, cells = state
         gain, bend, shares = torch.split(weights * _CAUTION, [1, 3, 2], 1)
         open_, hidden = torch.split(F.avg_pool2d(shares, CELL), 1, 1)
         *flow, seen, around = torch.split(cells, 3, 1)
-        x, y, z, rest = (
-            F.interpolate(part, scale_factor=CELL, mode="bilinear", align_corners=False)
-            for part in (*flow, seen * open_ + around * (hidden * _GUESS))
-        )
-        i, j, k = torch.split(normal + bend, 1, 1)
+        rest = seen * open_ + around * (hidden * _GUESS)
+        carried = enlarged(torch.cat([*flow, rest], 1), surface, pixels, CELL)
+        x, y, z, rest = torch.split(carried, 3, 1)
+        i, j, k = torch.split(pixels[:, :3] + bend, 1, 1)
         return (x * i + y * j + z * k + rest) * torch.exp(gain.clamp(-_MOST, _MOST))
 
     def receptive_field(self, pixel: int) -> Span:
@@ -271,26 +271,3 @@ def _moved(x: Tensor, ring: int) -> Tensor:
         cut = (-margin - columns, columns - margin, -margin - rows, rows - margin)
         moved.append(F.pad(turns[row * TURNS + column], cut))
     return torch.cat(moved, 2)
-
-
-def _smoothed(carried: Tensor, normal: Tensor, position: Tensor) -> Tensor:
-    """What cells carry (N, C, h, w), the mean over 3 x 3, so over all turns, of one surface.
-
-    `normal` and `position` (N, 3, h, w) are zero where a cell's point shows nothing: such a cell
-    takes what those around it have.
-    """
-    valid = covered(position[:, 2:])
-    wide = F.pad(torch.cat([carried * valid, position, valid], 1), (1, 1, 1, 1))
-    total, weights = carried * 0, valid * 0
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            part = F.pad(wide, (-1 - right, right - 1, -1 - down, down - 1))
-            light, there, known = torch.split(part, [carried.shape[1], 3, 1], 1)
-            delta = there + position * -1
-            square = (delta * delta).sum(1, keepdim=True).clamp_min(1e-12)
-            off = (delta * normal).sum(1, keepdim=True)  # the tangent plane
-            same = (off * off / square * -_BENT + 1).clamp_min(1e-3)
-            weight = same * ((2.0 - abs(down)) * (2.0 - abs(right)))
-            total = total + light * weight
-            weights = weights + known * weight
-    return total / weights.clamp_min(1e-6)

@@ -6,7 +6,9 @@ motion nearby that reaches it (tiles as in M. McGuire, P. Hennessy, M. Bukowski 
 Reconstruction Filter for Plausible Motion Blur*, I3D 2012; two directions as in J.-P. Guertin,
 M. McGuire and D. Nowrouzezahrai, *A Fast and Stable Feature-Aware Motion Blur Filter*, HPG 2014).
 Unlike there, moments are composited one by one, near over far, and what covers nothing is what the
-own surface uncovers.
+own surface uncovers. Along their own motion neighbouring pixels look at moments that lie half-way
+between each other's, as squares of a chessboard, and the mean along it is shown, so that edges and
+bright spots come in half as coarse steps.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from torch.nn import functional as F
 
 from deepshade_trainer.networks.bases.base import Bases, State
 from deepshade_trainer.networks.horizons import sampled
-from deepshade_trainer.networks.receptive_field import Span
+from deepshade_trainer.networks.receptive_field import Span, folded, joined
 
 # Pixels along the side of a tile that has one largest motion.
 _TILE = 16
@@ -40,6 +42,7 @@ class Lines(Bases):
     weights = 4
     size_multiple = _TILE
     cell = 2
+    reach = 1
 
     def __init__(self, moments: int = 8) -> None:
         super().__init__()
@@ -58,7 +61,8 @@ class Lines(Bases):
         tiles = self._strongest(half)  # (N, 2, H / 16, W / 16)
         strong = F.interpolate(tiles, scale_factor=float(_TILE), mode="nearest")
         scene = torch.cat([motion, far, light], 1)
-        passes, stays = _Line(scene, strong), _Line(scene, motion)
+        passes = _Line(scene, strong)
+        stays = _Line(scene, motion, _chessboard(far) * (0.5 / self.moments))
         sums = [torch.zeros_like(far) for _ in range(3)]
         lights = [torch.zeros_like(light) for _ in range(3)]
         for k in range(self.moments):
@@ -83,17 +87,20 @@ class Lines(Bases):
             place,
             (place < 1).to(place.dtype),
         ]
-        return torch.cat(told, 1), (light, covers, passing, mines, carried, rest, uncovered)
+        return torch.cat(told, 1), (light, covers, passing, mines, carried, rest, uncovered, motion)
 
     def carry(self, state: State, weights: Tensor) -> Tensor:
         """See `Bases.carry`."""
-        light, covers, passing, mines, carried, rest, uncovered = state
+        light, covers, passing, mines, carried, rest, uncovered, motion = state
         gains = (torch.tanh(weights * 0.2) * 5).exp()
-        gains = F.interpolate(gains, scale_factor=2.0, mode="nearest")
-        a, b, c, d = torch.split(gains, 1, 1)
+        a, b, c, d = (
+            F.interpolate(gain, scale_factor=2.0, mode="nearest")
+            for gain in torch.split(gains, 1, 1)
+        )
         c, d = c * (rest + 1e-4), d * _SHARE
         total = passing * a + carried * b + uncovered * c + light * d
-        return total / (covers * a + mines * b + c + d)
+        shown = total / (covers * a + mines * b + c + d)
+        return _smoothed(shown, motion * (1 / self.moments))
 
     def _strongest(self, own: Tensor) -> Tensor:
         """Per tile, of every second pixel's motion (N, 2, h, w), the one that reaches farthest."""
@@ -124,23 +131,24 @@ class Lines(Bases):
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Bases.receptive_field`."""
-        reach = int(_LONGEST / 2) + 2
-        tile = pixel // _TILE * _TILE
-        return (
-            min(pixel - reach, tile - _TILES * _TILE),
-            max(pixel + reach, tile + (_TILES + 1) * _TILE - 1),
-        )
+        first, last = pixel - self.reach, pixel + self.reach
+        along = int(_LONGEST / 2) + 2
+        tiles = first // _TILE - _TILES, last // _TILE + _TILES
+        return joined((first - along, last + along), folded(tiles, _TILE))
 
 
 class _Line:
     """What each pixel of a scene (motion, far, light) (N, 6, H, W) finds along a motion.
 
-    Offsets are whole pixels, so that no two engines round what lies between two differently.
+    Offsets are whole pixels, so that no two engines round what lies between two differently. A
+    pixel's moments are `shift` (1, 1, H, W) later, or earlier where its motion has the other sense:
+    both senses find the same.
     """
 
-    def __init__(self, scene: Tensor, motion: Tensor) -> None:
-        self.scene, self.motion = scene, motion
-        self.length = (motion * motion).sum(1, keepdim=True).sqrt()
+    def __init__(self, scene: Tensor, motion: Tensor, shift: Tensor | None = None) -> None:
+        u, v = torch.split(motion, 1, 1)
+        self.scene, self.motion = scene, (u, v)
+        self.length = (u * u + v * v).sqrt()
         x, y = (
             torch.arange(size, device=scene.device, dtype=scene.dtype) + 0.5
             for size in (scene.shape[3], scene.shape[2])
@@ -148,21 +156,53 @@ class _Line:
         self.place = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)  # (H, W, 2)
         self.scale = 2 / (self.place[-1:, -1:] + 0.5)
         self.last = motion.permute(0, 2, 3, 1)
+        self.start: Tensor | None = None
+        if shift is not None:
+            sense = ((u + v * 1e-4) >= 0).to(shift.dtype) * 2 - 1
+            self.start = self.last * (sense * shift).permute(0, 2, 3, 1)
 
     def at(self, moment: float) -> tuple[Tensor, Tensor, Tensor]:
         """Whether what moves over the pixel then covers it (N, 1, H, W), how far it is, its light.
 
         It covers in full where it misses by less than is allowed, and from twice that on not.
         """
-        grid = (self.place - (self.last * moment).round()) * self.scale - 1
+        offset = self.last * moment
+        if self.start is not None:
+            offset = offset + self.start
+        grid = (self.place - offset.round()) * self.scale - 1
         found = F.grid_sample(
             self.scene, grid, mode="nearest", padding_mode="border", align_corners=False
         )
-        motion, far, light = torch.split(found, [2, 1, 3], 1)
-        away = motion - self.motion
-        miss = (away * away).sum(1, keepdim=True)
+        *motion, far, light = torch.split(found, [1, 1, 1, 3], 1)
+        u, v = (there - own for there, own in zip(motion, self.motion, strict=True))
+        miss = u * u + v * v
         allowed = abs(moment) / (self.length * (0.2 * abs(moment)) + 1)
         return ((4 - miss * (allowed * allowed)) / 3).clamp(0, 1), far, light
+
+
+def _chessboard(like: Tensor) -> Tensor:
+    """-.5 and .5 on the squares of a chessboard (1, 1, H, W)."""
+    height, width = like.shape[2:]
+    rows, columns = (
+        torch.arange(size, device=like.device, dtype=like.dtype) * 0.5 for size in (height, width)
+    )
+    both = rows[:, None] + columns
+    return ((both - both.floor()) * 2 - 0.5)[None, None]
+
+
+def _smoothed(shown: Tensor, step: Tensor) -> Tensor:
+    """Colours (N, 3, H, W), the mean with both neighbours along a motion.
+
+    `step` (N, 2, H, W) is what moves between two moments; in part where that is under a pixel.
+    """
+    right, down = torch.split(step.abs(), 1, 1)
+    lies = (right >= down).to(step.dtype)
+    share = torch.maximum(right, down).clamp(max=1) * 0.25
+    across, along = lies * share, (1 - lies) * share
+    right = shown[:, :, :, 1:] - shown[:, :, :, :-1]
+    down = shown[:, :, 1:] - shown[:, :, :-1]
+    beside = (F.pad(right, (0, 1)) - F.pad(right, (1, 0))) * across
+    return shown + beside + (F.pad(down, (0, 0, 0, 1)) - F.pad(down, (0, 0, 1, 0))) * along
 
 
 def _doublings(depth: Tensor) -> Tensor:
