@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 
 from deepshade.camera import Camera
+from deepshade_workers.backend import mitsuba
 from deepshade_workers.lighting import direct_light
+from deepshade_workers.sampling import split
 from deepshade_workers.scenes.mesh import merge
 from deepshade_workers.scenes.scene import Scene
 from deepshade_workers.trace import trace
 from deepshade_workers.view import View
 
 from .conftest import lit, quad
+
+mi = mitsuba()
 
 LAMP = np.array([0.5, 1.5, 0.2])
 
@@ -119,3 +123,13 @@ def test_what_stands_between_casts_its_shadow(down: Camera) -> None:
     apart = np.maximum(np.abs(points[0] - 4), np.abs(points[2]))
     assert (part[ground & (apart < 0.39)] == 0).all()
     assert (part[ground & (apart > 0.41)] > 0).all()
+
+
+def test_a_choice_that_is_sure_holds_for_a_number_that_was_rounded_to_1() -> None:
+    """(7 + the largest float below 1) / 8 is 1: metals, all specular, had pixels of NaN by it."""
+    last = (mi.Float(7) + (1 - 2.0**-24)) / 8
+    assert last.numpy() == 1
+    chosen, rest = split(last, mi.Float(1))
+    assert chosen.numpy() and 0 <= rest.numpy() < 1
+    chosen, rest = split(last, mi.Float(0.5))
+    assert not chosen.numpy() and 0 <= rest.numpy() < 1

@@ -44,8 +44,10 @@ def pixel_streams(count: int, seed: int) -> Any:
 def split(number: Any, share: Any) -> tuple[Any, Any]:
     """Whether uniform `number` in [0, 1) is below `share`, and what is left of it, uniform again.
 
-    A choice made so keeps the strata of the number within each case.
+    A choice made so keeps the strata of the number within each case. A number of the last stratum
+    may have been rounded to 1: it is below a share of 1 all the same.
     """
+    number = dr.minimum(number, _BELOW_1)
     chosen = number < share
     rest = dr.select(chosen, number / share, (number - share) / (1 - share))
     return chosen, dr.clip(rest, 0, _BELOW_1)
