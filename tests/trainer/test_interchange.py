@@ -76,6 +76,21 @@ def test_16_bits_and_an_input_for_each_attribute(tmp_path: Path) -> None:
     assert {each.engine: each.takes for each in made.takers}["Unity Inference Engine"] is False
 
 
+@pytest.mark.slow
+def test_16_bits_are_for_convolutions_alone_at_one_size_too(tmp_path: Path) -> None:
+    """`gi` blends cells by the places of pixels, in float32; folding the size lost one mark."""
+    bundle = Bundle.load(MODELS / "gi/balanced")
+    made = write_plain(bundle, tmp_path, (WIDTH, HEIGHT), precision="fp16")
+    given = {"gbuffer": gbuffer(bundle)}
+    program = session(made.path)
+    expected = session(bundle.model).run(None, given)[0]
+    assert expected.std() > 1e-3
+    assert np.abs(program.run(None, given)[0] - expected).max() < 0.005 * expected.max()
+    outputs = {name for node in onnx.load(str(made.path)).graph.node for name in node.output}
+    facts = program.get_modelmeta().custom_metadata_map
+    assert set(json.loads(facts["deepshade:float32"])) <= outputs
+
+
 def test_what_engines_get_wrong_is_said_otherwise() -> None:
     helper = onnx.helper
     rng = np.random.default_rng(0)

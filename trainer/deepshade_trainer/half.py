@@ -8,6 +8,7 @@ import numpy as np
 
 from deepshade.bundles import Bundle
 from deepshade.errors import ConfigError
+from deepshade_trainer.graph import CONVOLUTIONS
 
 _MOST = 65504.0  # of float16
 
@@ -81,7 +82,11 @@ def halve(model: Any, bundle: Bundle) -> Any:
 
 
 def _between(graph: Any, bundle: Bundle, floats: set[str]) -> set[str]:
-    """The tensors that may be float16: neither before `float32` marks nor after the others."""
+    """The tensors that may be float16: convolutions and what depends on them, between the marks.
+
+    Neither what lies before `float32` marks nor after the others; and as a graph for one size may
+    lack a mark that it had folded away, nothing that no such convolution has a part in.
+    """
     before, after = set(bundle.float32 or ()), set(bundle.float32_after or ())
     exact = set(before)
     for node in reversed(graph.node):  # what a mark depends on, but not past the other marks
@@ -92,12 +97,13 @@ def _between(graph: Any, bundle: Bundle, floats: set[str]) -> set[str]:
         if (late | after).intersection(node.input):
             late.update(name for name in node.output if name not in before)
     known = {tensor.name for tensor in graph.initializer}
-    return {
-        name
-        for node in graph.node
-        for name in node.output
-        if name in floats - exact - late and not known.issuperset(node.input)
-    }
+    free = floats - exact - late
+    found: set[str] = set()
+    for node in graph.node:
+        learnt = node.op_type in CONVOLUTIONS or found.intersection(node.input)
+        if learnt and not known.issuperset(node.input):
+            found.update(free.intersection(node.output))
+    return found
 
 
 def _sizes(node: Any, k: int) -> bool:

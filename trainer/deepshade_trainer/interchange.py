@@ -86,7 +86,7 @@ def write_plain(
         if apart:
             take_apart(model, bundle)
         _set_opset(model, opset)
-        onnx.helper.set_model_props(model, facts(bundle))
+        onnx.helper.set_model_props(model, _known(facts(bundle), model))
         onnx.save(model, str(temporary))
         apart_by = _difference(bundle, temporary, size)
         difference = float(apart_by.max() if precision == "fp32" else apart_by.mean())
@@ -117,6 +117,18 @@ def plain(bundle: Bundle, size: Size | None = None) -> Any:
         model = fold(raw, Path(scratch) / "folded.onnx")
     del model.graph.value_info[:]
     return easier(model)
+
+
+def _known(facts: dict[str, str], model: Any) -> dict[str, str]:
+    """Facts that name tensors, without those that a graph for one size has folded away."""
+    made = {name for node in model.graph.node for name in node.output}
+    marks = {
+        key: json.loads(facts[key]) for key in ("deepshade:float32", "deepshade:float32_after")
+    }
+    return facts | {
+        key: json.dumps(names if names is None else [name for name in names if name in made])
+        for key, names in marks.items()
+    }
 
 
 def facts(bundle: Bundle) -> dict[str, str]:
