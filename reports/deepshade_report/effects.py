@@ -22,7 +22,7 @@ from deepshade.machine import cpu_count
 from deepshade.manifest import Manifest
 from deepshade_report.baselines import folder as baselines_of
 from deepshade_report.context import Context, machine
-from deepshade_report.method import NETWORK, PAPER, PAPER_NETWORK
+from deepshade_report.method import LIMIT, NETWORK, PAPER, PAPER_NETWORK
 from deepshade_report.report import measure
 from deepshade_report.sections import Point, Sections, data, points
 from deepshade_report.sections.methods import methods, shaded
@@ -40,7 +40,8 @@ class Figures:
 
     `ours` are our networks where they run by default, `first` of them the one that rivals are held
     against; `paper` is the paper's, and `alike` our first on its engine, in its precision. `rivals`
-    maps each to its setting of least error and the best one that takes no longer than `first`.
+    maps each to its setting of least error and the best one that takes no longer than `first`;
+    `limits` names those that are no rivals, but what there is to reach.
 
     Raises DataError: no error or speed of ours was measured, with the reason.
     """
@@ -70,6 +71,7 @@ class Figures:
             None,
         )
         self.rivals: dict[str, tuple[Point, Point | None]] = {}
+        self.limits = {point.name for point in found if point.family == LIMIT}
         others = [point for point in found if point.family not in (NETWORK, PAPER_NETWORK)]
         for name in dict.fromkeys(point.name for point in others):
             own = sorted((p for p in others if p.name == name), key=lambda point: point.error)
@@ -79,13 +81,15 @@ class Figures:
     @property
     def rival(self) -> Point | None:
         """The best setting of the best rival."""
-        best = (best for best, _ in self.rivals.values())
+        best = (best for name, (best, _) in self.rivals.items() if name not in self.limits)
         return min(best, key=lambda point: point.error, default=None)
 
     @property
     def quick(self) -> Point | None:
         """The best of what rivals reach in our time."""
-        fitting = (quick for _, quick in self.rivals.values() if quick)
+        fitting = (
+            quick for name, (_, quick) in self.rivals.items() if quick and name not in self.limits
+        )
         return min(fitting, key=lambda point: point.error, default=None)
 
 
@@ -105,6 +109,8 @@ def table(found: Figures) -> list[str]:
             lines.append(_line(f"`{found.alike.name}`, alike", found.alike, found.alike.backend))
     for name, (best, quick) in found.rivals.items():
         lines.append(_line(name, best, _setting(best)))
+        if name in found.limits:
+            continue
         if quick is None:
             lines.append(f"| {name} in our time | none is as quick | | | | |")
         elif quick is not best:
@@ -233,7 +239,7 @@ def _to_cards(context: Context, found: Figures) -> None:
     """Our times, so that cards and pages say the same."""
     for bundle in context.served:
         points = [p for p in (*found.ours, found.alike) if p and p.name == bundle.name]
-        times = {point.backend: round(point.milliseconds, 2) for point in points}
+        times = {point.backend: round(point.milliseconds, 4) for point in points}
         record_speed(bundle, str(machine()["processor"]), times)
 
 

@@ -18,6 +18,7 @@ from deepshade_trainer.evaluation import prepared
 
 PAPER = "paper"  # the name of the bundle that is a baseline
 NETWORK, PAPER_NETWORK = "network", "paper's network"
+LIMIT = "limit"  # no shader for real time: about the least error that one layer allows
 
 
 class Method(Protocol):

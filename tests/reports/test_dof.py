@@ -1,4 +1,4 @@
-"""The ring gather against what a lens does to points, edges and even light."""
+"""The ring gather and marched rays against what a lens does to points, edges and even light."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from .plates import noise, plates
 
 try:
     from deepshade_report.baselines.dof import rings
+    from deepshade_report.baselines.dof.onelayer import onelayer
 except (ModuleNotFoundError, DeepshadeError) as error:  # no Dr.Jit or no libLLVM
     pytest.skip(f"no compiled kernels here: {error}", allow_module_level=True)
 
@@ -94,3 +95,49 @@ def test_settings_go_from_cheap_to_best() -> None:
     taps = [(2 * m.settings["rings"] - 1) ** 2 / (4 if m.settings["half"] else 1) for m in every]
     assert taps == sorted(taps)
     assert len(quick) < len(every)
+
+
+def marched(rays: int, view: View) -> Float:
+    method = onelayer(rays)
+    method.prepare(view)
+    return np.asarray(method.shade(view))
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_marched_rays_spread_a_point_evenly_over_its_circle(side: int) -> None:
+    light = np.zeros((64, 64))
+    light[32, 32] = 1000.0
+    view = plates("dof", focal=np.full((64, 64), side * 24.0), light=light)
+    image = marched(4096, view)[0]
+    row, column = np.mgrid[:64, :64]
+    distance = np.hypot(row - 32, column - 32)
+    assert image[distance > 12 + 1].max() == 0
+    assert image[distance < 11].mean() == pytest.approx(1000 / (np.pi * 12**2), rel=0.05)
+
+
+@pytest.mark.parametrize(("near", "far"), [(-24.0, 0.0), (-24.0, 16.0), (0.0, 24.0)])
+def test_marched_rays_meet_what_is_nearest(near: float, far: float) -> None:
+    left = np.zeros((64, 128), bool)
+    left[:, :64] = True
+    view = plates("dof", focal=np.where(left, near, far), light=np.where(left, 1.0, 0.0))
+    image = marched(512, view)[0][16:-16].mean(0)
+    # the share of the near half's circle beyond a line; what that hides is continued
+    away = np.arange(128) - 63.5
+    d = np.clip(away / max(-near / 2, 1e-3), -1, 1)
+    exact = (np.arccos(d) - d * np.sqrt(1 - d * d)) / np.pi
+    assert image == pytest.approx(exact, abs=0.03)
+
+
+def test_marched_rays_keep_what_is_in_focus_and_carry_light_linearly() -> None:
+    light = noise(32, 48)
+    still = plates("dof", focal=np.zeros((32, 48)), light=light)
+    assert marched(64, still) == pytest.approx(light, rel=1e-5)
+    focal = np.random.default_rng(2).normal(0, 10, (32, 48))
+    one, two = (marched(64, plates("dof", focal=focal, light=light * f)) for f in (1, 1e5))
+    assert two == pytest.approx(1e5 * one, rel=1e-4)
+
+
+@pytest.mark.parametrize("focal", [-9.0, 9.0, 1e6, np.inf])
+def test_marched_rays_of_one_pixel(focal: float) -> None:
+    view = plates("dof", focal=np.full((1, 1), focal), light=np.full((1, 1), 2.0))
+    assert marched(64, view) == pytest.approx(2)

@@ -20,6 +20,8 @@ from deepshade_workers.backend import mitsuba
 
 mi = mitsuba()
 
+SCREEN_SPACE = "screen-space"
+
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
 class Grid:
@@ -97,8 +99,6 @@ class Filter:
     of Python.
     """
 
-    family = "screen-space"
-
     def __init__(
         self,
         name: str,
@@ -108,10 +108,11 @@ class Filter:
         kernel: Callable[..., Any],
         *,
         recorded: bool = False,
+        family: str = SCREEN_SPACE,
     ) -> None:
         if recorded:
             kernel = dr.freeze(kernel, limit=4, warn_after=1 << 30)
-        self.name, self.settings, self.parameters = name, settings, parameters
+        self.name, self.settings, self.parameters, self.family = name, settings, parameters, family
         self._upload, self._kernel = upload, kernel
         self._frame: Any = None
         self._shape = (0, 0)

@@ -19,6 +19,7 @@ import drjit as dr
 
 from deepshade_report.baselines.gi.lit import Lit, open_lit
 from deepshade_report.baselines.picture import Filter, mi
+from deepshade_report.method import LIMIT
 from deepshade_report.tuning import Ranges, Tunable, tuned
 from deepshade_workers.sampling import pixel_streams, random_pair, strata
 
@@ -43,7 +44,7 @@ RANGES: Ranges = {"thickness": (0.02, 2.0)}
 def onelayer(rays: int, parameters: Parameters | None = None) -> Filter:
     """Marched rays as a Method, with the parameters that were tuned or those given."""
     parameters = parameters or replace(PUBLISHED, **tuned(__package__, "onelayer"))
-    return Filter("marched rays", {"rays": rays}, parameters, open_lit, _shade)
+    return Filter("marched rays", {"rays": rays}, parameters, open_lit, _shade, family=LIMIT)
 
 
 TUNABLE = Tunable(partial(onelayer, QUICK[0]), PUBLISHED, RANGES)
