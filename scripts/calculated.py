@@ -33,7 +33,7 @@ NOTES = {
     "what `{}`, whose weights it holds, says under a white map. Sampling is coarse where a radius "
     "is few pixels: contact shadows thinner than a cell are soft; what isn't in the picture blocks "
     "nothing." + _MAPS.format("`lobes`, `turn` and `camera`"),
-    "dof": "Light is spread over discs of six sizes, near and far side apart; all is calculated. "
+    "dof": "Light is spread over discs of ten sizes, near and far side apart; all is calculated. "
     "Near edges of large circles are a little off where the picture doesn't show what is behind "
     "them.",
     "full": "The light of `ibl/balanced`, times `{}`, whose weights it holds, through the lens of "

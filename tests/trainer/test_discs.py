@@ -52,7 +52,7 @@ def test_constant_light_is_kept() -> None:
     torch.testing.assert_close(_shaded(gbuffer), gbuffer[:, 1:], rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize("radius", [4.0, 9.0, 12.0, 20.0])
+@pytest.mark.parametrize("radius", [2.0, 3.0, 4.0, 4.5, 9.0, 12.0, 20.0])
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_point_spreads_over_its_circle_and_keeps_its_energy(side: int, radius: float) -> None:
     gbuffer = torch.zeros(1, 4, 96, 96)

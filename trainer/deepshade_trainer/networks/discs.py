@@ -9,17 +9,23 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from deepshade_trainer.networks.enlarging import Twice
 from deepshade_trainer.networks.network import Network, full_precision
 from deepshade_trainer.networks.receptive_field import Span, doubled, folded, grown, joined
 
-# Radii of blur in pixels: what lies between two of them is shared out to both. Below the first
-# pixels are partly sharp. Those up to _HALF are spread at half resolution, others at a quarter.
-_RADII = (2.0, 3.0, 5.0, 9.0, 16.0, 24.0)
-_HALF = 5.0
+# Radii of blur in pixels at which light is spread at full resolution, at half and at a quarter of
+# it: what lies between two of them is shared out to both.
+_FULL = (0.0, 1.0, 2.0, 3.0, 4.0)
+_HALF = (5.0, 7.0, 9.0)
+_QUARTER = (12.0, 17.0, 24.0)
+_COARSE = (*_HALF, *_QUARTER)
 # Pooling and enlarging blur like a disc of about this radius, squared, at half and at a quarter.
 _SOFT, _SOFTER = 16 / 3, 24.0
-_HIDDEN = 10.0  # over about which radius what a near surface hides is continued
+_APART = 1.0  # the radius from which on, to the next pixel, near surfaces lie over all others
+_WIDE = 2.0  # that from which on, to twice that, they show what they hide
+_HIDDEN = 10.0  # over about which radius what they hide is continued
 _FAINT = 1e-4  # how much a sharp pixel counts in the blurred picture, so that it has no holes
+_LEAST = 0.05  # how much of what is behind all is made up to a whole
 _CLOSED = 1e-6  # how much shows through what covers all, so that nothing divides by 0
 
 
@@ -42,9 +48,10 @@ class Discs(Network):
     Processing in Call of Duty: Advanced Warfare", 2014), each by its coverage. What a near surface
     hides from the pinhole and shows through its edge is continued from around.
 
-    What is blurred is composited at half resolution and enlarged once. Its eight channels are
-    coverage and premultiplied light of the near side, then of the far side: engines keep eight
-    together, and fixed convolutions put values where they are needed sooner than splits would.
+    Small circles are spread at full resolution, where what is in focus, or hardly before it, goes
+    with the far side; large ones at half and less. Layers have eight channels: coverage and
+    premultiplied light of the near side, then of the far one. Engines keep eight together, and
+    fixed convolutions put values where they are needed sooner than splits would.
     """
 
     linear = True
@@ -54,15 +61,15 @@ class Discs(Network):
 
     sides: Tensor
     least: Tensor
-    side: Tensor
-    both: Tensor
-    light: Tensor
-    one: Tensor
-    first: Tensor
-    over: Tensor
-    open: Tensor
-    before: Tensor
     far: Tensor
+    before: Tensor
+    behind: Tensor
+    pooled_side: Tensor
+    pooled_sides: Tensor
+    pooled_light: Tensor
+    pooled_coverage: Tensor
+    pooled_first: Tensor
+    over: Tensor
     hidden: Tensor
 
     def __init__(self, config: DiscsConfig | None = None) -> None:
@@ -73,22 +80,23 @@ class Discs(Network):
         kernels = {
             "sides": torch.tensor([-0.5, 0.5])[None, :, None, None],
             "least": torch.tensor([0, _FAINT])[None, :, None, None],
-            "side": _pooling(side),
-            "both": _pooling(torch.ones(8, 2)),
-            "light": _pooling(light),
-            "one": _pooling(coverage[:, None].repeat(1, 2)),
-            "first": coverage[None, :, None, None],
-            "over": (side[:, 1:] * side[:, 1] * coverage)[:, :, None, None],
-            "open": (side[:, 1:] * coverage)[:, :, None, None],
-            "before": side[:, 0],
             "far": side[:, 1][None, :, None, None],
+            "before": side[:, 0],
+            "behind": side[:, 1:, None, None],
+            "pooled_side": _pooling(side),
+            "pooled_sides": _pooling(torch.ones(8, 2)),
+            "pooled_light": _pooling(light),
+            "pooled_first": _pooling(coverage[:4, None]),
+            "pooled_coverage": _pooling(coverage[:, None].repeat(1, 2)),
+            "over": (side[:, 1:] * side[:, 1] * coverage)[:, :, None, None],
+            "hidden": _discs(_HIDDEN / 4, 4),
         }
-        kernels["hidden"] = _discs(_HIDDEN / 4, 4)
-        for radius in _RADII[1:]:
-            soft, size = (_SOFT, 2) if radius <= _HALF else (_SOFTER, 4)
-            kernels[f"disc{radius:g}"] = _discs(math.sqrt(radius**2 - soft) / size, 8)
+        for radii, soft, size in ((_FULL[1:], 0, 1), (_HALF, _SOFT, 2), (_QUARTER, _SOFTER, 4)):
+            for radius in radii:
+                kernels[f"disc{radius:g}"] = _discs(math.sqrt(radius**2 - soft) / size, 8)
         for name, kernel in kernels.items():
             self.register_buffer(name, kernel, persistent=False)
+        self.twice, self.twice_four = Twice(8), Twice(4)
 
     def forward(self, gbuffer: Tensor) -> Tensor:
         """See `Network.forward`."""
@@ -97,71 +105,93 @@ class Discs(Network):
 
     def spread(self, focal: Tensor, light: Tensor) -> Tensor:
         """The answer (N, 3, H, W) to blur circles (N, 1, H, W) and light (N, 3, H, W)."""
+        radius = focal.abs() * 0.5
+        coarse = (radius - _FULL[-1]).clamp(0, 1)
+        fine = self._fine(focal, radius, light, coarse)
+        blurred = self.twice(self._blurred(focal, light, coarse))
+        near, near_light, middle, middle_light = torch.split(fine, [1, 3, 1, 3], 1)
+        more, more_light, far, far_light = torch.split(blurred, [1, 3, 1, 3], 1)
+        near = near + more
+        # What each leaves is for the next; what is last is made up to a whole.
+        left = 1 - near.clamp(max=1)
+        middles = left / middle.clamp_min(1)
+        fars = left * (1 - middle.clamp(max=1)) / far.clamp_min(_LEAST)
+        total = near_light + more_light + middles * middle_light + fars * far_light
+        # nowhere 0: where nothing else is, there is what is faint
+        return total / (near + middles * middle + fars * far)
+
+    def _fine(self, focal: Tensor, radius: Tensor, light: Tensor, coarse: Tensor) -> Tensor:
+        """Small circles, (N, 8, H, W). Of each pixel the share `coarse` isn't among them."""
+        apart = (focal * -0.5 - _APART).clamp(0, 1)
+        near, other = (1 - coarse) * apart, (1 - coarse) * (1 - apart)
+        lit = torch.cat([near, near * light, other, other * light], 1)
+        spread = torch.zeros(())
+        for k, size in enumerate(_FULL[1:], 1):
+            spread = spread + _spread(lit * _share(radius, _FULL, k), self._disc(size))
+        # Nothing from behind spreads over what is sharp.
+        over = F.conv2d((radius * 2).clamp(0, 1), self.behind, self.before)
+        return lit * _share(radius, _FULL, 0) + spread * over
+
+    def _blurred(self, focal: Tensor, light: Tensor, coarse: Tensor) -> Tensor:
+        """Large circles, and what near surfaces hide, (N, 8, H / 2, W / 2)."""
         # (N, 1, 2, H, W), before and behind the focus: engines would pad 2 channels to 8
         radius = F.relu(focal[:, None] * self.sides[:, None])
-        share = (radius / _RADII[0]).clamp(max=1) + self.least[:, None]
+        share = (radius - _FULL[-1]).clamp(0, 1) + self.least[:, None]
         share, outer = share.flatten(1, 2), (share * radius).flatten(1, 2)  # (N, 2, H, W)
-        blurred = focal.abs() * (0.5 / _RADII[0])
         # All from here on is (N, 8, H / 2, W / 2). A cell's light is of both sides, where it has.
-        cover = F.conv2d(share, self.side, stride=2)
-        reach = F.conv2d(outer, self.side, stride=2) / cover.clamp_min(1e-6)
-        lit = F.conv2d(light * (blurred.clamp(max=1) + _FAINT), self.light, stride=2)
-        lit = lit + F.conv2d(share, self.one, stride=2)
-        lit = lit * (cover / F.conv2d(share, self.both, stride=2))
-
-        def layer(k: int) -> Tensor:
-            """What has a circle of about the k-th radius."""
-            here, rise, fall = _RADII[k], torch.ones(()), torch.ones(())
-            if k:
-                rise = (reach - _RADII[k - 1]) / (here - _RADII[k - 1])
-            if k + 1 < len(_RADII):
-                fall = (_RADII[k + 1] - reach) / (_RADII[k + 1] - here)
-            return lit * torch.minimum(rise, fall).clamp(0, 1)
-
-        mild, strong = layer(0), torch.zeros(())
+        cover = F.conv2d(share, self.pooled_side, stride=2)
+        reach = F.conv2d(outer, self.pooled_side, stride=2) / cover.clamp_min(1e-6)
+        lit = F.conv2d(light * (coarse + _FAINT), self.pooled_light, stride=2)
+        lit = lit + F.conv2d(share, self.pooled_coverage, stride=2)
+        lit = lit * (cover / F.conv2d(share, self.pooled_sides, stride=2))
         # Before the focus all adds up. Behind it, what is blurred less is nearer and lies over the
-        # rest: what is sharp over all, the least blurred over what is two radii on.
-        # Through what reaches into the focus nothing shows, but through a wide near surface.
-        wide = torch.maximum((reach / _RADII[0] - 1).clamp(0, 1), self.far) * cover
-        opening = F.conv2d(wide, self.open, self.before)
-        layers, under = mild * opening, opening - F.conv2d(mild, self.over)
-        for k, size in enumerate(_RADII[1:], 1):
-            spread = getattr(self, f"disc{size:g}")
-            if size > _HALF:
-                strong = strong + _spread(F.avg_pool2d(layer(k), 2), spread)
+        # rest. Through what is sharp nothing shows, but through a wide near surface.
+        wide = F.avg_pool2d((focal * (-0.5 / _WIDE) - 1).clamp(0, 1), 2)
+        opening = 1 - self.far + self.far * (cover + wide)
+        under, mild, layers, strong = opening, *(torch.zeros(()) for _ in range(3))
+        for k, size in enumerate(_COARSE):
+            layer, disc = lit * _share(reach, _COARSE, k), self._disc(size)
+            if size in _QUARTER:
+                strong = strong + _spread(F.avg_pool2d(layer, 2), disc)
                 continue
-            more = _spread(layer(k), spread)
-            layers = layers + more * (opening if k == 1 else under.clamp(_CLOSED, 1))
-            mild = mild + more
-        under = opening - F.conv2d(mild, self.over)
-        layers = layers + _twice(strong) * under.clamp(_CLOSED, 1)
+            more = _spread(layer, disc)
+            layers, mild = layers + more * under.clamp(_CLOSED, 1), mild + more
+            under = opening - F.conv2d(mild, self.over)
+        layers = layers + self.twice(strong) * under.clamp(_CLOSED, 1)
         # What a near surface hides.
-        other = light * (1 + focal * (0.5 / _RADII[0])).clamp(0, 1)
-        other = F.conv2d(other, self.light, stride=2) + (1 - cover) * self.first
-        hidden = _twice(_spread(F.avg_pool2d(other, 2)[:, :4], self.hidden))
-        seen = wide[:, :1] * (1 - layers[:, 4:5]).clamp_min(0)
+        other = (1 + focal * (0.5 / _WIDE)).clamp(0, 1)
+        other = F.conv2d(other, self.pooled_first, stride=2) + F.conv2d(
+            other * light, self.pooled_light[:4], stride=2
+        )
+        hidden = self.twice_four(_spread(F.avg_pool2d(other, 2), self.hidden))
+        seen = wide * (1 - layers[:, 4:5]).clamp_min(0)
         hidden = hidden * (seen / hidden[:, :1].clamp_min(1e-6))
-        near, far = torch.split(layers, 4, 1)
-        left = 1 - near[:, :1].clamp(max=1)
-        total = near + (far + hidden) * left
-        left, total, colour = torch.split(_twice(torch.cat([left, total], 1)), [1, 1, 3], 1)
-        # nowhere 0: where nothing else is, there is what is faint
-        sharp = (1 - blurred).clamp_min(0) * left
-        # Not as a difference: beside a light of 1e5 nothing would be left of what is dark.
-        return colour / total * (1 - sharp) + light * sharp
+        both: Tensor = layers + F.pad(hidden, (0, 0, 0, 0, 4, 0))
+        return both
+
+    def _disc(self, radius: float) -> Tensor:
+        """The kernel of that radius, at the resolution where it spreads."""
+        return self.get_buffer(f"disc{radius:g}")
 
     def receptive_field(self, pixel: int) -> Span:
         """See `Network.receptive_field`."""
-        half = doubled((pixel, pixel))
-        mild, strong = (
-            max(
-                self.get_buffer(f"disc{r:g}").shape[-1] // 2 for r in _RADII[1:] if (r > _HALF) == s
-            )
-            for s in (False, True)
+        full, mild, strong = (
+            max(self._disc(radius).shape[-1] // 2 for radius in radii)
+            for radii in (_FULL[1:], _HALF, _QUARTER)
         )
-        quarter = grown(doubled(half), strong)
-        wide = joined(grown(half, mild), folded(quarter, 2))
-        return joined(folded(wide, 2), (pixel, pixel))
+        half = doubled((pixel, pixel))
+        wide = joined(grown(half, mild), folded(grown(doubled(half), strong), 2))
+        return joined(folded(wide, 2), grown((pixel, pixel), full))
+
+
+def _share(radius: Tensor, radii: tuple[float, ...], k: int) -> Tensor:
+    """How much of what has this radius is spread by the k-th of `radii`."""
+    sides = []
+    if k:
+        sides.append((radius - radii[k - 1]) / (radii[k] - radii[k - 1]))
+    if k + 1 < len(radii):
+        sides.append((radii[k + 1] - radius) / (radii[k + 1] - radii[k]))
+    return (sides[0] if len(sides) == 1 else torch.minimum(*sides)).clamp(0, 1)
 
 
 def _pooling(places: Tensor) -> Tensor:
@@ -181,11 +211,3 @@ def _discs(radius: float, count: int) -> Tensor:
 def _spread(planes: Tensor, discs: Tensor) -> Tensor:
     """Each plane convolved with its disc; nothing lies beyond the picture."""
     return F.conv2d(planes, discs, padding=discs.shape[-1] // 2, groups=discs.shape[0])
-
-
-def _twice(planes: Tensor) -> Tensor:
-    """Bilinear (N, C, 2 H, 2 W). Engines are quicker at it when each plane is a picture."""
-    count, channels, height, width = planes.shape
-    alone = planes.reshape(-1, 1, height, width)
-    twice = F.interpolate(alone, scale_factor=2, mode="bilinear", align_corners=False)
-    return twice.reshape(count, channels, 2 * height, 2 * width)

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from deepshade_trainer.networks.bases.base import Bases, State
+from deepshade_trainer.networks.enlarging import Twice
 from deepshade_trainer.networks.horizons import covered
 from deepshade_trainer.networks.network import constant
 from deepshade_trainer.networks.receptive_field import Span, doubled, folded, grown, joined
@@ -28,7 +29,8 @@ from deepshade_trainer.networks.receptive_field import Span, doubled, folded, gr
 # Levels of the pyramid: cells are 2^level pixels wide.
 _LEVELS = 7
 # The Gaussians' deviation in cells, all told; pooling and interpolating do _SPREAD of its square.
-_SIGMA, _SPREAD = 0.8, 0.3
+_SIGMA, _SPREAD = 1.0, 0.3
+_FINEST = 0.8  # the finest Gaussian's, in pixels
 # The coarsest level also makes the Gaussian an octave wider, from more of its cells.
 _REACH = 2
 # The mass of all Gaussians narrower than 1 is about (1 + ax + bx^2) / (1 + cx + ex^2 + gx^3),
@@ -37,7 +39,8 @@ _TOP, _BOTTOM = (8.2926, 85.373), (8.9354, 53.337, 296.64)
 _FOLD = 4
 _STEEPEST = 8.0
 _FARTHEST = 256.0  # mean free paths are cut there, in deviations of the finest Gaussian
-_SLACK = 4.0  # how many cells apart in depth are still one surface
+_SLACK = 8.0  # how many cells apart in depth are still one surface
+_GUIDE = 4.0  # how far off a cell still lends its Gaussians, in its own widths
 _AWAY, _TINY = 1e9, 1e-9
 _ANGLE = 1 / 500  # of a pixel, where nothing tells
 
@@ -59,6 +62,10 @@ class Diffusion(Bases):
     size_multiple = 2**_LEVELS
     reach = 8
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.twice, self.twice_three = Twice(6), Twice(3)
+
     def features(self, gbuffer: Tensor) -> tuple[Tensor, State]:
         """See `Bases.features`."""
         position, scatter, light = torch.split(gbuffer, 3, 1)
@@ -67,8 +74,9 @@ class Diffusion(Bases):
         both = torch.cat([scatters * light, scatters], 1)
         near = _blurred(both)
 
-        # Half resolution, then coarser: mean positions, their light and area.
-        pooled = F.avg_pool2d(torch.cat([position * cover, cover, both], 1), 2)
+        # Half resolution, then coarser: mean positions of what scatters, its light and area.
+        there = scatters.amax(1, keepdim=True)
+        pooled = F.avg_pool2d(torch.cat([position * there, there, both], 1), 2)
         place, some, both = torch.split(pooled, [3, 1, 6], 1)
         place = place / some.clamp_min(0.25)
         some = (some * 4).clamp(0, 1)
@@ -95,7 +103,7 @@ class Diffusion(Bases):
         # All wide Gaussians, at a quarter of the resolution.
         wide = torch.cat(sums[_LEVELS - 1 :], 1)
         for level in range(_LEVELS - 1, 1, -1):
-            wide = _guided(wide, levels[level], levels[level - 1], 2.0 ** (level + 1))
+            wide = _guided(wide, levels[level], levels[level - 1], _GUIDE * 2**level)
             wide = torch.cat([sums[level - 1], wide], 1)
 
         size = position[:, 2:] * -sizes[0] + _TINY
@@ -118,7 +126,7 @@ class Diffusion(Bases):
         paths, some = torch.split(half, 3, 1)
         paths = paths / some.clamp_min(0.25)
         total = middle * _pair(
-            (_finer(paths * 0.25) - _finer(paths * 0.5)) * _twice(_gain(levels[0]))
+            (_finer(paths * 0.25) - _finer(paths * 0.5)) * self.twice_three(_gain(levels[0]))
         )
         quarter, some = torch.split(F.avg_pool2d(half, 2), 3, 1)
         quarter = quarter / some.clamp_min(0.0625)
@@ -129,7 +137,7 @@ class Diffusion(Bases):
                 torch.split(wide, 6, 1), itertools.pairwise(finer), levels[1:], strict=True
             )
         ]
-        total = _twice(total + _twice(torch.stack(parts).sum(0)))
+        total = self.twice(total + self.twice(torch.stack(parts).sum(0)))
 
         own = _finer(path)
         finest = (_finer(path * 0.5) - own) * torch.exp(fine)
@@ -269,8 +277,8 @@ def _slope(place: Tensor, some: Tensor, size: Tensor) -> Tensor:
 
 
 def _blurred(both: Tensor) -> Tensor:
-    """(N, 6, H, W) by a Gaussian of deviation `_SIGMA`, cut at 3 x 3."""
-    side = _SIGMA**2 / 2
+    """(N, 6, H, W) by a Gaussian of deviation `_FINEST`, cut at 3 x 3."""
+    side = _FINEST**2 / 2
     line = constant((side, 1 - 2 * side, side), both)
     kernel = (line[:, None] * line).expand(6, 1, 3, 3)
     return F.conv2d(both, kernel, padding=1, groups=6)
@@ -296,11 +304,6 @@ def _square(vector: Tensor) -> Tensor:
 def _cut(wide: Tensor, margin: int, down: int, right: int) -> Tensor:
     """`wide` without its margin, moved."""
     return F.pad(wide, (-margin - right, right - margin, -margin - down, down - margin))
-
-
-def _twice(x: Tensor) -> Tensor:
-    """Bilinear at twice the resolution."""
-    return F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 
 def _repeated(x: Tensor, times: int) -> Tensor:
