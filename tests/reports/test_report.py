@@ -23,7 +23,8 @@ from deepshade.errors import ConfigError, DataError
 from deepshade_report import baselines, page, plots, report
 from deepshade_report.cli import report as command
 from deepshade_report.context import Context
-from deepshade_report.method import Network
+from deepshade_report.effects import Figures
+from deepshade_report.method import LIMIT, Network
 from deepshade_report.sections import Point, Skipped, frontier, points, same_time, summary
 from deepshade_report.view import body, load_views, resized
 
@@ -208,6 +209,22 @@ def test_like_is_compared_with_like() -> None:
     best = same_time(made_up())[-1]["reached"]
     assert best["<HBAO>"]["dssim"] == 0.07
     assert same_time(made_up())[0]["reached"]["<HBAO>"] is None
+
+
+def test_what_is_a_limit_is_no_rival() -> None:
+    sections = made_up()
+    for name in ("error", "speed"):
+        found = sections[name]["data"]
+        found["missing"] = {}
+        *_, first, second = (dict(row) for row in found["rows"])
+        for row in (first, second):
+            row |= {"name": "rays", "family": LIMIT, "id": f"rays {row['settings']}"}
+            row |= {"dssim": 0.001, "each": [0.001]} if name == "error" else {}
+            found["rows"].append(row)
+    figures = Figures(sections)
+    assert figures.rival is not None and figures.rival.name == "<HBAO>"
+    assert figures.quick is None
+    assert figures.rivals["rays"][0].error == 0.001
 
 
 def test_the_frontier_is_what_nothing_beats() -> None:
