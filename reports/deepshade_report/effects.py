@@ -40,8 +40,8 @@ class Figures:
 
     `ours` are our networks where they run by default, `first` of them the one that rivals are held
     against; `paper` is the paper's, and `alike` our first on its engine, in its precision. `rivals`
-    maps each to its setting of least error and the best one that takes no longer than `first`;
-    `limits` names those that are no rivals, but what there is to reach.
+    maps each to its setting of least error and the best one that takes no longer than `first`.
+    `limits` are no rivals, but what there is to reach: each at its least error.
 
     Raises DataError: no error or speed of ours was measured, with the reason.
     """
@@ -71,25 +71,26 @@ class Figures:
             None,
         )
         self.rivals: dict[str, tuple[Point, Point | None]] = {}
-        self.limits = {point.name for point in found if point.family == LIMIT}
+        self.limits: list[Point] = []
         others = [point for point in found if point.family not in (NETWORK, PAPER_NETWORK)]
         for name in dict.fromkeys(point.name for point in others):
             own = sorted((p for p in others if p.name == name), key=lambda point: point.error)
+            if own[0].family == LIMIT:
+                self.limits.append(own[0])
+                continue
             quick = next((point for point in own if point.cost <= self.first.cost), None)
             self.rivals[name] = own[0], quick
 
     @property
     def rival(self) -> Point | None:
         """The best setting of the best rival."""
-        best = (best for name, (best, _) in self.rivals.items() if name not in self.limits)
+        best = (best for best, _ in self.rivals.values())
         return min(best, key=lambda point: point.error, default=None)
 
     @property
     def quick(self) -> Point | None:
         """The best of what rivals reach in our time."""
-        fitting = (
-            quick for name, (_, quick) in self.rivals.items() if quick and name not in self.limits
-        )
+        fitting = (quick for _, quick in self.rivals.values() if quick)
         return min(fitting, key=lambda point: point.error, default=None)
 
 
@@ -109,12 +110,11 @@ def table(found: Figures) -> list[str]:
             lines.append(_line(f"`{found.alike.name}`, alike", found.alike, found.alike.backend))
     for name, (best, quick) in found.rivals.items():
         lines.append(_line(name, best, _setting(best)))
-        if name in found.limits:
-            continue
         if quick is None:
             lines.append(f"| {name} in our time | none is as quick | | | | |")
         elif quick is not best:
             lines.append(_line(f"{name} in our time", quick, _setting(quick)))
+    lines += [_line(point.name, point, _setting(point)) for point in found.limits]
     if (floor := error["floor"]) is not None:
         share = 100 * floor / error["trivial_dssim"]
         lines.append(f"| noise in the reference | | {_short(floor)} | {share:.1f} % | | |")

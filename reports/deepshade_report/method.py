@@ -17,7 +17,8 @@ from deepshade_report.view import Float, View, require
 from deepshade_trainer.evaluation import prepared
 
 PAPER = "paper"  # the name of the bundle that is a baseline
-NETWORK, PAPER_NETWORK = "network", "paper's network"
+# families
+NETWORK, PAPER_NETWORK, SCREEN_SPACE = "network", "paper's network", "screen-space"
 LIMIT = "limit"  # no shader for real time: about the least error that one layer allows
 
 

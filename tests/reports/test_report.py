@@ -224,7 +224,7 @@ def test_what_is_a_limit_is_no_rival() -> None:
     figures = Figures(sections)
     assert figures.rival is not None and figures.rival.name == "<HBAO>"
     assert figures.quick is None
-    assert figures.rivals["rays"][0].error == 0.001
+    assert [(point.name, point.error) for point in figures.limits] == [("rays", 0.001)]
 
 
 def test_the_frontier_is_what_nothing_beats() -> None:

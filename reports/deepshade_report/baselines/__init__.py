@@ -8,7 +8,7 @@ from types import ModuleType
 
 from deepshade.errors import DeepshadeError
 from deepshade.extras import extra_of, install_command
-from deepshade_report.method import Method
+from deepshade_report.method import SCREEN_SPACE, Method
 
 
 def folder(effect: str) -> ModuleType | None:
@@ -42,7 +42,7 @@ def baselines(
             missing[name] = f"no module '{error.name}'{fix}"
         except DeepshadeError as error:
             missing[name] = f"{error} {error.fix}".strip()
-    if threads and any(method.family == "screen-space" for method in found):
+    if threads and any(method.family == SCREEN_SPACE for method in found):
         import drjit
 
         drjit.set_thread_count(threads)

@@ -15,12 +15,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from deepshade_report.method import SCREEN_SPACE
 from deepshade_report.view import Float, View
 from deepshade_workers.backend import mitsuba
 
 mi = mitsuba()
-
-SCREEN_SPACE = "screen-space"
 
 
 @dataclass  # not frozen: Dr.Jit writes a loop's state back
