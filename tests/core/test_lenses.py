@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,6 +106,12 @@ def test_what_says_nothing(header):
 
 def test_a_panorama_s_header():
     assert lens_in({"envmap": 0, "deepshade:fov": 90.0}, DISPLAY) == Lens("latlong", 360.0)
+
+
+@pytest.mark.parametrize("value", [np.zeros((3, 3), np.float32), "latlong", 0.5])
+def test_what_is_no_envmap_by_that_name_says_nothing(value: Any) -> None:
+    found = lens_in({"envmap": value, "deepshade:fov": 90.0}, DISPLAY)
+    assert found == Lens("perspective", 90.0)
 
 
 def test_a_header_that_nobody_needs_blocks_nothing():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from deepshade import exr
 from deepshade.camera import Camera, Projection, matrix_from_header
 from deepshade.errors import CameraError
-from deepshade.gbuffer.lenses import LATLONG, Lens, lens_in
+from deepshade.gbuffer.lenses import LATLONG, Lens, envmap, lens_in
 from deepshade.gbuffer.profiles import Profile
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def see(
         lens = said if said and projection in (None, said.projection) else None
     plan.projection = projection or (lens.projection if lens else None)
     if lens is None:
-        if facts.get("envmap", LATLONG) != LATLONG:
+        if envmap(facts) not in (None, LATLONG):
             plan.unusable["fov"] = "the header's envmap is a cube, which isn't read"
         return
     plan.camera = Camera.framed(

@@ -44,9 +44,15 @@ class Lens:
     width: float
 
 
+def envmap(header: Header) -> int | None:
+    """OpenEXR's number of a whole surrounding, or None; a file may hold anything by that name."""
+    found = header.get("envmap")
+    return found if isinstance(found, int) else None
+
+
 def lens_in(header: Header, display: Window, fov: tuple[str, ...] = ()) -> Lens | None:
     """What a header says of the lens, or None. `fov` are more attributes with an angle."""
-    if header.get("envmap") == LATLONG:
+    if envmap(header) == LATLONG:
         return Lens("latlong", 360.0)
     across = number(header, "deepshade:ortho_width")
     if across > 0:
